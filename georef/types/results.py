@@ -1,0 +1,60 @@
+"""Outcomes of localization: every image has one."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from enum import StrEnum
+
+import numpy as np
+from numpy.typing import NDArray
+
+from georef.geometry.rigid import Array, Rigid3
+
+
+class RejectReason(StrEnum):
+    """Why an image has no pose."""
+
+    UNREADABLE = "unreadable"  # the file cannot be decoded
+    WRONG_SIZE = "wrong_size"  # the image does not have the size of its camera
+    NO_PRIOR = "no_prior"  # no position at all, and a whole-reference search was not allowed
+    FEW_FEATURES = "few_features"
+    NO_CANDIDATES = "no_candidates"  # no reference image can see the same place
+    FEW_MATCHES = "few_matches"
+    FEW_INLIERS = "few_inliers"
+    DEGENERATE = "degenerate"  # geometry that does not fix the pose
+    PRIOR_CONTRADICTS = "prior_contradicts"  # the images say one place, the position prior another
+    INTERNAL = "internal"  # an unexpected error in the computation of this image, its text in `detail`
+
+
+@dataclass(frozen=True, eq=False)
+class ReferenceMatches:
+    """Verified correspondences of a query image with one reference image, as keypoint indices."""
+
+    reference_id: str
+    indices: NDArray[np.int32]  # (M, 2): query keypoint, reference keypoint
+
+
+@dataclass(frozen=True, eq=False)
+class Localized:
+    """The pose of an image with a covariance that can be believed, and what it rests on."""
+
+    image_id: str
+    world_from_cam: Rigid3
+    world_from_cam_cov: Array  # (6, 6), right perturbation, (rad, m), relative to the reference as a whole
+    correspondence_count: int  # points used
+    sigma0_px: float  # a-posteriori noise of an observation, full-resolution pixels
+    matches: tuple[ReferenceMatches, ...]
+    gnss_rejected: bool = False
+    notes: tuple[str, ...] = ()
+    cpu_s: dict[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, eq=False)
+class Rejected:
+    image_id: str
+    reason: RejectReason
+    detail: str
+    notes: tuple[str, ...] = ()
+
+
+Outcome = Localized | Rejected
