@@ -16,7 +16,10 @@ from pathlib import Path
 
 
 class GeorefError(Exception):
-    """Base of all errors that are meant for the user. The message is complete as it is."""
+    """Base of all errors that are meant for the user. The lines together are the message, complete as it is."""
+
+    def __init__(self, *lines: str) -> None:
+        super().__init__("\n".join(line for line in lines if line))
 
 
 class InputError(GeorefError):

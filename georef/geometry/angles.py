@@ -22,6 +22,8 @@ IMAGE_FROM_CAM = np.diag([1.0, -1.0, -1.0])
 _LEVEL_NORTH = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 """enu_from_cam of a level camera that looks north."""
 
+_GIMBAL_LOCK = 1e-10  # cosine of the middle angle below which the outer two are one
+
 
 def rotation_x(angle_rad: float) -> Array:
     c, s = np.cos(angle_rad), np.sin(angle_rad)
@@ -49,9 +51,12 @@ def omega_phi_kappa_from_rotation(axes_from_cam: Array) -> Array:
     r = axes_from_cam @ IMAGE_FROM_CAM
     cos_phi = float(np.hypot(r[0, 0], r[0, 1]))
     phi = float(np.arctan2(r[0, 2], cos_phi))
-    if cos_phi < 1e-10:
+    if cos_phi < _GIMBAL_LOCK:
         return np.array([np.arctan2(r[1, 0] * np.sign(phi), r[1, 1]), phi, 0.0])
-    return np.array([np.arctan2(-r[1, 2], r[2, 2]), phi, np.arctan2(-r[0, 1], r[0, 0])])
+    omega = float(np.arctan2(-r[1, 2], r[2, 2]))
+    # Near phi = +-90 deg omega is ill-determined: kappa follows from it, so that the three still give the rotation.
+    kappa_only = (rotation_x(omega) @ rotation_y(phi)).T @ r
+    return np.array([omega, phi, np.arctan2(kappa_only[1, 0], kappa_only[0, 0])])
 
 
 def rotation_from_yaw_pitch_roll(angles_rad: Sequence[float] | Array) -> Array:
@@ -61,11 +66,16 @@ def rotation_from_yaw_pitch_roll(angles_rad: Sequence[float] | Array) -> Array:
 
 
 def yaw_pitch_roll_from_rotation(axes_from_cam: Array) -> Array:
-    """yaw, pitch, roll (3,) in radians, pitch in [-pi/2, pi/2]."""
-    forward, right, down = axes_from_cam[:, 2], axes_from_cam[:, 0], axes_from_cam[:, 1]
-    yaw = np.arctan2(forward[0], forward[1])
-    pitch = np.arctan2(forward[2], np.hypot(forward[0], forward[1]))
-    return np.array([yaw, pitch, np.arctan2(-right[2], -down[2])])
+    """yaw, pitch, roll (3,) in radians, pitch in [-pi/2, pi/2]; at pitch = +-90 deg roll is set to 0."""
+    right, forward = axes_from_cam[:, 0], axes_from_cam[:, 2]
+    cos_pitch = float(np.hypot(forward[0], forward[1]))
+    pitch = float(np.arctan2(forward[2], cos_pitch))
+    if cos_pitch < _GIMBAL_LOCK:
+        return np.array([np.arctan2(-right[1], right[0]), pitch, 0.0])
+    yaw = float(np.arctan2(forward[0], forward[1]))
+    # Near pitch = +-90 deg yaw is ill-determined: roll follows from it, so that the three still give the rotation.
+    roll_only = (rotation_z(-yaw) @ _LEVEL_NORTH @ rotation_x(pitch)).T @ axes_from_cam
+    return np.array([yaw, pitch, np.arctan2(roll_only[1, 0], roll_only[0, 0])])
 
 
 def omega_phi_kappa_jacobian(axes_from_cam: Array) -> Array:

@@ -16,7 +16,8 @@ from numpy.typing import ArrayLike
 from georef.geometry.rigid import Array
 
 CameraModel = Literal["pinhole", "brown"]
-_UNDISTORT_ITERATIONS = 20
+_UNDISTORT_ITERATIONS, _UNDISTORTED = 12, 1e-15
+_SMALLEST_DETERMINANT, _LARGEST_STEP = 1e-3, 0.5  # of Newton's method
 
 
 @dataclass(frozen=True)
@@ -60,7 +61,11 @@ def project(camera: Camera, points_in_cam: ArrayLike) -> Array:
 
 
 def ideal_from_observed(camera: Camera, pixels: ArrayLike) -> Array:
-    """Distortion-free pixels (N, 2) of the same calibration matrix, from observed pixels (N, 2)."""
+    """Distortion-free pixels (N, 2) of the same calibration matrix, from observed pixels (N, 2).
+
+    Newton's method; to 1e-9 px wherever the distortion has an inverse. Beyond the radius at which a strong negative
+    k1 folds the image back on itself it has none: the result there is finite, and `project` does not return the pixel.
+    """
     observed = np.asarray(pixels, dtype=np.float64)
     if not camera.distortion:
         return observed
@@ -68,7 +73,10 @@ def ideal_from_observed(camera: Camera, pixels: ArrayLike) -> Array:
     distorted = (observed - centre) / focal
     slopes = distorted.copy()
     for _ in range(_UNDISTORT_ITERATIONS):
-        slopes = slopes + (distorted - _distort(slopes, camera.distortion))
+        error = _distort(slopes, camera.distortion) - distorted
+        if np.abs(error).max(initial=0.0) < _UNDISTORTED:
+            break
+        slopes = slopes - _newton_step(slopes, error, camera.distortion)
     return slopes * focal + centre
 
 
@@ -92,3 +100,17 @@ def _distort(slopes: Array, distortion: tuple[float, ...]) -> Array:
         ],
         axis=-1,
     )
+
+
+def _newton_step(slopes: Array, error: Array, distortion: tuple[float, ...]) -> Array:
+    """Change of slopes (N, 2) that removes an error (N, 2) of the distorted slopes; bounded, so that it stays finite."""
+    k1, k2, p1, p2 = distortion
+    x, y = slopes[..., 0], slopes[..., 1]
+    r2 = x * x + y * y
+    radial, radial_rate = 1.0 + r2 * (k1 + k2 * r2), 2.0 * (k1 + 2.0 * k2 * r2)
+    xx = radial + radial_rate * x * x + 2.0 * p1 * y + 6.0 * p2 * x
+    xy = radial_rate * x * y + 2.0 * p1 * x + 2.0 * p2 * y  # the derivative is symmetric
+    yy = radial + radial_rate * y * y + 6.0 * p1 * y + 2.0 * p2 * x
+    determinant = np.maximum(xx * yy - xy * xy, _SMALLEST_DETERMINANT)
+    step = np.stack([yy * error[..., 0] - xy * error[..., 1], xx * error[..., 1] - xy * error[..., 0]], axis=-1)
+    return np.clip(step / determinant[..., None], -_LARGEST_STEP, _LARGEST_STEP)

@@ -18,7 +18,9 @@ class Features:
     image_size: tuple[int, int]  # width, height
     keypoints_px: NDArray[np.float32]  # (N, 2)
     scores: NDArray[np.float32]  # (N,)
-    scales_px: NDArray[np.float32]  # (N,) size in full-resolution pixels of what the detector localised: its noise scales with it
+    scales_px: NDArray[
+        np.float32
+    ]  # (N,) size in full-resolution pixels of what the detector localised: its noise scales with it
     descriptors: NDArray[np.float32] | NDArray[np.float16] | NDArray[np.uint8]  # (N, D)
     colors_rgb: NDArray[np.uint8]  # (N, 3)
 

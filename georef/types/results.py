@@ -8,6 +8,7 @@ from enum import StrEnum
 import numpy as np
 from numpy.typing import NDArray
 
+from georef.geometry.covariance import pose_cov_from_parts
 from georef.geometry.rigid import Array, Rigid3
 
 
@@ -42,9 +43,12 @@ class Localized:
     world_from_cam: Rigid3
     world_from_cam_cov: Array  # (6, 6), right perturbation, (rad, m), relative to the reference as a whole
     correspondence_count: int  # points used
-    sigma0_px: float  # a-posteriori noise of an observation, full-resolution pixels
+    sigma0: float  # a-posteriori over a-priori standard deviation of an observation
     matches: tuple[ReferenceMatches, ...]
+    points_in_world: Array  # (P, 3) the map points behind the correspondences
+    keypoints: NDArray[np.int64]  # (P,) the query keypoints that see them
     gnss_rejected: bool = False
+    gnss_offset_m: float | None = None  # distance from a rejected position prior
     notes: tuple[str, ...] = ()
     cpu_s: dict[str, float] = field(default_factory=dict)
 
@@ -58,3 +62,21 @@ class Rejected:
 
 
 Outcome = Localized | Rejected
+
+
+@dataclass(frozen=True)
+class ReferenceNoise:
+    """How well the reference and its keypoints are known, each relative to the reference as a whole."""
+
+    keypoint_sigma: float  # 1-sigma of a keypoint coordinate, in units of its scale
+    position_sigma_m: tuple[float, float, float]  # of a reference position, east, north, up
+    rotation_sigma_rad: tuple[float, float, float]  # about the camera axes
+    source: str  # "declared" or "estimated"
+
+    def pose_cov(self, world_from_cam: Rigid3) -> Array:
+        """Covariance (6, 6) of a reference pose."""
+        return pose_cov_from_parts(
+            world_from_cam,
+            np.diag(np.square(self.position_sigma_m)),
+            np.diag(np.square(self.rotation_sigma_rad)),
+        )

@@ -1,0 +1,205 @@
+"""Configuration: frozen, validated models, one section a room; `configs/default.toml` explains every key."""
+
+from __future__ import annotations
+
+import difflib
+import tomllib
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any, Literal, TypeVar
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from georef.errors import ConfigError
+
+M = TypeVar("M", bound=BaseModel)
+
+
+class Section(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+
+class FeaturesConfig(Section):
+    extractor: str = "aliked-n16"
+    longest_side_px: int = Field(1024, ge=64)
+    max_keypoints: int = Field(4096, ge=16)
+
+
+class MatchingConfig(Section):
+    matcher: str = "lightglue-aliked"
+    max_keypoints: int = Field(2048, ge=16)
+    options: dict[str, str | int | float | bool] = {}
+
+
+class CandidatesConfig(Section):
+    box: Literal["reach", "published"] = "reach"
+    min_half_side_m: float = Field(15.0, gt=0)
+    viewing_reach_m: float = Field(30.0, gt=0)
+    heading_window_deg: float = Field(90.0, gt=0, le=180)
+    count: int = Field(10, ge=2)
+    first_count: int = Field(4, ge=2)
+    vote_keypoints: int = Field(512, ge=16)
+    max_searched: int = Field(2000, ge=2)
+
+
+class LocalizeConfig(Section):
+    method: Literal["query-centred", "published"] = "query-centred"
+    ransac_gate_px: float = Field(12.0, gt=0)
+    guided_gate: float = Field(3.0, gt=0)
+    guided_min_similarity: float = Field(0.6, ge=0, le=1)
+    guided_ratio: float = Field(0.95, gt=0, le=1)
+    min_inliers: int = Field(20, ge=6)
+    min_inlier_ratio: float = Field(0.1, ge=0, le=1)
+    max_position_sigma_m: float = Field(1.0, gt=0)
+    max_correspondences: int = Field(0, ge=0)
+    seed: int = 0
+
+
+class NetworkConfig(Section):
+    neighbours: int = Field(6, ge=2)
+    max_images: int = Field(40, ge=4)
+    max_points_per_image: int = Field(300, ge=20)
+    max_keypoints: int = Field(2048, ge=64)
+    max_suspect_share: float = Field(0.1, ge=0, le=0.5)
+
+
+class AdjustConfig(Section):
+    constraints: Literal["auto-gcps", "pose-priors", "none"] = "auto-gcps"
+    tie_points: bool = True
+    gnss: bool = True
+    surveyed_control: bool = False
+    max_points_per_image: int = Field(1500, ge=20)
+    cauchy_scale: float = Field(2.0, gt=0)
+    gate_probability: float = Field(0.999, gt=0.5, lt=1)
+    max_iterations: int = Field(30, ge=1)
+
+
+class ReportConfig(Section):
+    recording: bool = True
+    recording_image_side_px: int = Field(768, ge=64)
+    recording_max_points: int = Field(200_000, ge=0)
+
+
+class RunConfig(Section):
+    workers: int = Field(1, ge=1)
+    threads: int = Field(0, ge=0)
+
+
+class Config(Section):
+    features: FeaturesConfig = FeaturesConfig()
+    matching: MatchingConfig = MatchingConfig()
+    candidates: CandidatesConfig = CandidatesConfig()
+    localize: LocalizeConfig = LocalizeConfig()
+    network: NetworkConfig = NetworkConfig()
+    adjust: AdjustConfig = AdjustConfig()
+    report: ReportConfig = ReportConfig()
+    run: RunConfig = RunConfig()
+
+
+def presets_folder() -> Path:
+    """Where the presets lie: inside an installed package, or in `configs/` of a checkout."""
+    installed = Path(__file__).parent / "_configs"
+    return installed if installed.is_dir() else Path(__file__).parent.parent / "configs"
+
+
+def load_config(preset: str, layers: Iterable[Mapping[str, Any]] = ()) -> Config:
+    """The default, a preset on top (a name of `configs/` or a path to a TOML file), then layers of nested tables.
+
+    Raises ConfigError with the key, its value and the nearest valid key.
+    """
+    merged: dict[str, Any] = {}
+    for layer in (read_toml(presets_folder() / "default.toml"), _read_preset(preset), *layers):
+        merged = merge(merged, layer)
+    return validated(Config, merged, "the configuration")
+
+
+def _read_preset(preset: str) -> Mapping[str, Any]:
+    path = Path(preset)
+    if path.suffix != ".toml":
+        path = presets_folder() / f"{preset}.toml"
+        known = sorted(p.stem for p in presets_folder().glob("*.toml"))
+        if preset not in known:
+            raise ConfigError(
+                f"There is no preset '{preset}'.{_nearest(preset, known)}\nExpected one of {', '.join(known)}, "
+                "or the path of a .toml file."
+            )
+    return read_toml(path)
+
+
+def read_toml(path: Path) -> dict[str, Any]:
+    """A TOML file as nested tables; ConfigError with line and column where it is not valid."""
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8-sig"))
+    except FileNotFoundError:
+        raise ConfigError(f"There is no file {path}.") from None
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise ConfigError(f"Not valid TOML: {error}.\nIn {path}.") from None
+
+
+def merge(base: Mapping[str, Any], top: Mapping[str, Any]) -> dict[str, Any]:
+    """Nested tables, the keys of `top` winning."""
+    out = dict(base)
+    for key, value in top.items():
+        below = out.get(key)
+        out[key] = merge(below, value) if isinstance(below, Mapping) and isinstance(value, Mapping) else value
+    return out
+
+
+def parse_overrides(settings: Iterable[str]) -> dict[str, Any]:
+    """`section.key=value` strings as nested tables; the value is TOML where it reads as TOML, else a string."""
+    merged: dict[str, Any] = {}
+    for setting in settings:
+        key, equals, text = setting.partition("=")
+        parts = [part.strip() for part in key.split(".")]
+        if not equals or len(parts) < 2 or not all(parts):
+            raise ConfigError(f"--set {setting!r} cannot be read.\nExpected section.key=value, e.g. adjust.gnss=false.")
+        try:
+            value = tomllib.loads(f"value = {text}")["value"]
+        except tomllib.TOMLDecodeError:
+            value = text.strip()
+        nested: Any = value
+        for part in reversed(parts):
+            nested = {part: nested}
+        merged = merge(merged, nested)
+    return merged
+
+
+def validated(model: type[M], data: Mapping[str, Any], where: str) -> M:
+    """The validated model; ConfigError with every wrong key, its value, and the nearest valid key."""
+    try:
+        return model.model_validate(dict(data))
+    except ValidationError as error:
+        lines = [_explain(model, dict(item)) for item in error.errors()]
+        raise ConfigError("\n".join([*lines, f"In {where}."])) from None
+
+
+def _explain(model: type[BaseModel], item: dict[str, Any]) -> str:
+    path = [part for part in item["loc"] if not str(part).startswith(("function-", "literal["))]
+    key = ".".join(str(part) for part in path)
+    if item["type"] == "extra_forbidden":
+        valid = _keys_beside(model, path)
+        return f"Unknown key '{key}'.{_nearest(str(path[-1]), valid)} Valid keys here: {', '.join(valid)}."
+    if item["type"] == "missing":
+        return f"The key '{key}' is missing."
+    return f"The key '{key}' has the value {item['input']!r}: {item['msg'][0].lower()}{item['msg'][1:]}."
+
+
+def _keys_beside(model: type[BaseModel], path: list[Any]) -> list[str]:
+    current: Any = model
+    for part in path[:-1]:
+        field = current.model_fields.get(part) if hasattr(current, "model_fields") else None
+        current = _model_in(field.annotation) if field else current
+    return sorted(current.model_fields) if hasattr(current, "model_fields") else []
+
+
+def _model_in(annotation: Any) -> Any:
+    """The pydantic model inside an annotation such as `dict[str, Model]` or `Model | None`."""
+    if hasattr(annotation, "model_fields"):
+        return annotation
+    inner = [_model_in(arg) for arg in getattr(annotation, "__args__", ())]
+    return next((model for model in inner if model is not None), None)
+
+
+def _nearest(name: str, known: Iterable[str]) -> str:
+    close = difflib.get_close_matches(name, list(known), n=1, cutoff=0.5)
+    return f" Did you mean '{close[0]}'?" if close else ""

@@ -1,0 +1,1 @@
+"""Bundle adjustment in GTSAM: the problem, its solution, gates, posterior covariances and variance components."""

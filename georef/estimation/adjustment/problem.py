@@ -1,0 +1,155 @@
+"""What an adjustment is given: images, points, observations and weighted constraints. No check point fits in."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from georef.geometry.camera import Camera, ideal_from_observed
+from georef.geometry.covariance import pose_cov_from_parts
+from georef.geometry.projection import Views
+from georef.geometry.rigid import Array, Rigid3
+from georef.types.campaign import PosePrior, PositionPrior
+from georef.types.constraints import ControlPoint
+from georef.types.scene import Observations
+
+
+@dataclass(frozen=True, eq=False)
+class Orientation:
+    """A given exterior orientation of a reference image with uncorrelated position and rotation."""
+
+    world_from_cam: Rigid3
+    position_sigma_m: Array  # (3,) east, north, up
+    rotation_sigma_rad: Array  # (3,) about the camera axes
+
+    @property
+    def cov(self) -> Array:
+        """Covariance (6, 6), right perturbation."""
+        return pose_cov_from_parts(
+            self.world_from_cam,
+            np.diag(np.square(self.position_sigma_m)),
+            np.diag(np.square(self.rotation_sigma_rad)),
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class AutomaticGcps:
+    """K ground control points that come from the reference images instead of a survey.
+
+    `cov` is the image noise of their triangulation from references held at their given poses. What the references'
+    own errors add is shared among points, and carried along as derivatives: it enters the posterior, not the weights,
+    so that the result stays tied to the reference as it is published.
+    """
+
+    point: NDArray[np.int64]  # (K,) index in the problem's points, rising
+    position: Array  # (K, 3) in world
+    cov: Array  # (K, 3, 3)
+    ray_gcp: NDArray[np.int64]  # (n,) of each reference ray: which of the K
+    ray_reference: NDArray[np.int64]  # (n,) and which reference
+    by_reference_pose: Array  # (n, 3, 6) derivative of the position
+    reference_ids: tuple[str, ...]
+    reference_covs: Array  # (R, 6, 6)
+
+    def __len__(self) -> int:
+        return len(self.point)
+
+    @staticmethod
+    def none() -> AutomaticGcps:
+        empty = np.zeros(0, np.int64)
+        zero = np.zeros
+        return AutomaticGcps(empty, zero((0, 3)), zero((0, 3, 3)), empty, empty, zero((0, 3, 6)), (), zero((0, 6, 6)))
+
+    def take(self, keep: NDArray[np.bool_], renumber: NDArray[np.int64]) -> AutomaticGcps:
+        """The GCPs to keep (K,), their points renumbered by (P,)."""
+        rays = keep[self.ray_gcp]
+        return replace(
+            self,
+            point=renumber[self.point[keep]],
+            position=self.position[keep],
+            cov=self.cov[keep],
+            ray_gcp=(np.cumsum(keep) - 1)[self.ray_gcp[rays]],
+            ray_reference=self.ray_reference[rays],
+            by_reference_pose=self.by_reference_pose[rays],
+        )
+
+    def scaled(self, factor: float) -> AutomaticGcps:
+        """The same points with their image noise scaled by a factor."""
+        return replace(self, cov=self.cov * factor**2)
+
+    def information(self, count: int) -> Array:
+        """Prior information (count, 3, 3) of all points of the problem, zero for tie points."""
+        out = np.zeros((count, 3, 3))
+        out[self.point] = np.linalg.inv(self.cov)
+        return out
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """A bundle adjustment. Index i of the constraints is the image's position in `image_ids`."""
+
+    image_ids: tuple[str, ...]
+    cameras: tuple[Camera, ...]
+    world_from_cams: tuple[Rigid3, ...]  # approximate values
+    points: Array  # (P, 3) tie points and automatic GCPs, approximate values
+    observations: Observations  # of `points`
+    gcps: AutomaticGcps = field(default_factory=AutomaticGcps.none)
+    orientations: Mapping[int, Orientation] = field(default_factory=dict)  # given, with uncertainty
+    pose_priors: Mapping[int, PosePrior] = field(default_factory=dict)
+    position_priors: Mapping[int, PositionPrior] = field(default_factory=dict)
+    control: tuple[ControlPoint, ...] = ()
+
+    def __post_init__(self) -> None:
+        if not all(isinstance(point, ControlPoint) for point in self.control):
+            raise TypeError("only control points can take part in an adjustment")
+        if set(self.orientations) & set(self.pose_priors):
+            raise ValueError("an image has either a given exterior orientation or a pose prior")
+
+    @property
+    def views(self) -> Views:
+        return Views.of(self.world_from_cams, self.cameras)
+
+    def with_poses(self, world_from_cams: tuple[Rigid3, ...], points: Array) -> Problem:
+        return replace(self, world_from_cams=world_from_cams, points=points)
+
+    def scaled(self, factor: float) -> Problem:
+        """The same problem with the sigmas of all keypoints scaled, those behind the automatic GCPs included."""
+        return replace(self, observations=self.observations.scaled(factor), gcps=self.gcps.scaled(factor))
+
+    def restricted(self, observations: NDArray[np.bool_], gcps: NDArray[np.bool_]) -> Problem:
+        """Only the observations and automatic GCPs to keep, and the points that these still determine."""
+        kept = self.observations.take(observations)
+        needed = np.full(len(self.points), 2)
+        needed[self.gcps.point[gcps]] = 1
+        enough = np.bincount(kept.point, minlength=len(self.points)) >= needed
+        renumber = np.cumsum(enough) - 1
+        kept = kept.take(enough[kept.point])
+        return replace(
+            self,
+            points=self.points[enough],
+            observations=kept.with_points(renumber[kept.point]),
+            gcps=self.gcps.take(gcps & enough[self.gcps.point], renumber),
+        )
+
+
+def control_observations(problem: Problem) -> Observations:
+    """Marks of the control points as observations; point index is the position in `problem.control`.
+
+    Marks in images that are not part of the problem are left out.
+    """
+    index = {name: i for i, name in enumerate(problem.image_ids)}
+    rows = [
+        (p, index[mark.image_id], ideal_from_observed(problem.cameras[index[mark.image_id]], mark.pixel), mark.sigma_px)
+        for p, point in enumerate(problem.control)
+        for mark in point.marks
+        if mark.image_id in index
+    ]
+    return Observations(
+        point=np.array([row[0] for row in rows], dtype=np.int64),
+        view=np.array([row[1] for row in rows], dtype=np.int64),
+        pixel=np.array([row[2] for row in rows], dtype=np.float64).reshape(-1, 2),
+        sigma_px=np.array([row[3] for row in rows], dtype=np.float64),
+        keypoint=np.full(len(rows), -1, dtype=np.int64),
+    )

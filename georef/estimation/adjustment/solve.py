@@ -1,0 +1,148 @@
+"""The factor graph of a problem and its solution by GTSAM's Levenberg-Marquardt."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+
+from georef.estimation.adjustment.problem import Problem, control_observations
+from georef.geometry.projection import Views
+from georef.geometry.rigid import Array, Rigid3
+from georef.types.scene import Observations
+
+_STEP_TOLERANCE = 1e-7
+_LAMBDA_INITIAL = 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class Solution:
+    world_from_cams: tuple[Rigid3, ...]
+    points: Array  # (P, 3)
+    control_points: Array  # (C, 3) adjusted
+    iterations: int
+    converged: bool
+
+
+def solve(problem: Problem, *, cauchy_scale: float | None, max_iterations: int) -> Solution:
+    """Minimises the weighted squares of all residuals; image observations and priors with a Cauchy loss if a scale
+    (in sigmas) is given.
+
+    Plain integer keys: images, then points, then control points (bulk insertion passes keys as floats).
+    """
+    images, points = len(problem.image_ids), len(problem.points)
+    graph = gtsam.NonlinearFactorGraph()
+    _add_observations(graph, problem, problem.observations, images, cauchy_scale)
+    _add_observations(graph, problem, control_observations(problem), images + points, cauchy_scale)
+    _add_pose_priors(graph, problem, cauchy_scale)
+    gcps = problem.gcps
+    _add_point_priors(graph, images + gcps.point, gcps.position, gcps.cov, cauchy_scale)
+    control = problem.control
+    keys = images + points + np.arange(len(control))
+    _add_point_priors(graph, keys, [c.point_in_world for c in control], [c.cov for c in control], cauchy_scale)
+    values = _initial_values(problem, images, points)
+    return _optimize(graph, values, problem, max_iterations)
+
+
+def _add_observations(
+    graph: gtsam.NonlinearFactorGraph, problem: Problem, obs: Observations, first_key: int, cauchy_scale: float | None
+) -> None:
+    """Bulk insertion by image and noise level."""
+    order = np.lexsort((obs.sigma_px, obs.view))
+    view, sigma = obs.view[order], obs.sigma_px[order]
+    starts = np.flatnonzero(np.concatenate([[True], (np.diff(view) != 0) | (np.diff(sigma) != 0)])) if len(view) else []
+    for chunk in np.split(order, starts[1:]) if len(view) else []:
+        camera = problem.cameras[obs.view[chunk[0]]]
+        calibration = gtsam.Cal3_S2(camera.fx, camera.fy, 0.0, camera.cx, camera.cy)
+        model = _robust(gtsam.noiseModel.Isotropic.Sigma(2, float(obs.sigma_px[chunk[0]])), cauchy_scale)
+        keys = (first_key + obs.point[chunk]).astype(np.float64)
+        gtsam.utilities.insertProjectionFactors(
+            graph, int(obs.view[chunk[0]]), keys, np.asfortranarray(obs.pixel[chunk].T), model, calibration
+        )
+
+
+def _add_pose_priors(graph: gtsam.NonlinearFactorGraph, problem: Problem, cauchy_scale: float | None) -> None:
+    for index, given in problem.orientations.items():
+        graph.add(gtsam.PriorFactorPose3(index, _pose3(given.world_from_cam), _gaussian(given.cov)))
+    for index, prior in problem.pose_priors.items():
+        model = _robust(_gaussian(prior.cov), cauchy_scale)
+        graph.add(gtsam.PriorFactorPose3(index, _pose3(prior.world_from_cam), model))
+    for index, prior in problem.position_priors.items():
+        graph.add(gtsam.GPSFactor(index, prior.position_in_world, _robust(_gaussian(prior.cov), cauchy_scale)))
+
+
+def _add_point_priors(
+    graph: gtsam.NonlinearFactorGraph,
+    keys: Iterable[int],
+    positions: Iterable[Array],
+    covs: Iterable[Array],
+    cauchy_scale: float | None,
+) -> None:
+    for key, position, cov in zip(keys, positions, covs, strict=True):
+        graph.add(gtsam.PriorFactorPoint3(int(key), position, _robust(_gaussian(cov), cauchy_scale)))
+
+
+def _gaussian(cov: Array) -> gtsam.noiseModel.Gaussian:
+    return gtsam.noiseModel.Gaussian.Covariance(cov)
+
+
+def _robust(model: gtsam.noiseModel.Base, cauchy_scale: float | None) -> gtsam.noiseModel.Base:
+    if cauchy_scale is None:
+        return model
+    return gtsam.noiseModel.Robust.Create(gtsam.noiseModel.mEstimator.Cauchy.Create(cauchy_scale), model)
+
+
+def _initial_values(problem: Problem, images: int, points: int) -> gtsam.Values:
+    values = gtsam.Values()
+    for index, pose in enumerate(problem.world_from_cams):
+        values.insert(index, _pose3(pose))
+    for index, point in enumerate(problem.points):
+        values.insert(images + index, point)
+    for index, control in enumerate(problem.control):
+        values.insert(images + points + index, control.point_in_world)
+    return values
+
+
+def _optimize(
+    graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, problem: Problem, max_iterations: int
+) -> Solution:
+    parameters = gtsam.LevenbergMarquardtParams()
+    parameters.setlambdaInitial(_LAMBDA_INITIAL)
+    parameters.setLinearSolverType("MULTIFRONTAL_CHOLESKY")
+    optimizer = gtsam.LevenbergMarquardtOptimizer(graph, values, parameters)
+    images, points = len(problem.image_ids), len(problem.points)
+    before = _poses(values, images)
+    converged = False
+    for _ in range(max_iterations):
+        optimizer.iterate()
+        after = _poses(optimizer.values(), images)
+        # LM's own test stops early along weak datum modes: the largest change of a pose decides.
+        step = max((float(np.abs(a.local(b)).max()) for a, b in zip(before, after, strict=True)), default=0.0)
+        before = after
+        if step < _STEP_TOLERANCE:
+            converged = True
+            break
+    solved = optimizer.values()
+    return Solution(
+        world_from_cams=tuple(before),
+        points=np.array([solved.atPoint3(images + i) for i in range(points)]).reshape(-1, 3),
+        control_points=np.array([solved.atPoint3(images + points + i) for i in range(len(problem.control))]).reshape(
+            -1, 3
+        ),
+        iterations=int(optimizer.iterations()),
+        converged=converged,
+    )
+
+
+def _poses(values: gtsam.Values, images: int) -> list[Rigid3]:
+    return [Rigid3.from_matrix(values.atPose3(index).matrix()) for index in range(images)]
+
+
+def _pose3(pose: Rigid3) -> gtsam.Pose3:
+    return gtsam.Pose3(pose.matrix())
+
+
+def solution_views(problem: Problem, solution: Solution) -> Views:
+    return Views.of(solution.world_from_cams, problem.cameras)

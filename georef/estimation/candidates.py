@@ -1,0 +1,84 @@
+"""Which reference images can help to localize a query: by position, heading, common content and geometry."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from georef.config import CandidatesConfig
+from georef.features.nearest import MutualNearest
+from georef.geometry.projection import Views
+from georef.geometry.rigid import Array
+from georef.types.campaign import PositionPrior
+from georef.types.features import Features
+
+_VOTE_RATIO = 0.95
+_MAX_VIEWING_ANGLE_DEG = 60.0
+
+
+@dataclass(frozen=True, eq=False)
+class Box:
+    """The references inside the search box, nearest first."""
+
+    indices: NDArray[np.int64]
+    whole_reference: bool
+    note: str = ""
+
+
+def search_box(positions: Array, prior: PositionPrior | None, config: CandidatesConfig) -> Box:
+    """References (of positions (N, 3)) inside a square box about a position prior; widened until there are enough.
+
+    `published` takes the stated uncertainty as half the side; `reach` max(min_half_side, 3 sigma + viewing reach).
+    """
+    if prior is None:
+        return Box(np.arange(len(positions)), True, "no position prior: searched the whole reference")
+    offset = np.abs(positions[:, :2] - prior.position_in_world[:2]).max(axis=1)
+    sigma = float(np.sqrt(np.linalg.eigvalsh(prior.cov[:2, :2])[-1]))
+    if config.box == "published":
+        asked = sigma
+    else:
+        asked = max(config.min_half_side_m, 3.0 * sigma + config.viewing_reach_m)
+    half_side, needed = asked, min(config.count, len(positions))
+    while np.count_nonzero(offset <= half_side) < needed:
+        half_side *= 2.0
+    inside = np.flatnonzero(offset <= half_side)
+    note = ""
+    if half_side > asked:
+        found = np.count_nonzero(offset <= asked)
+        note = f"search box widened from {asked:.1f} to {half_side:.1f} m half side: {found} of {needed} references"
+    return Box(inside[np.argsort(offset[inside], kind="stable")], len(inside) == len(positions), note)
+
+
+def in_heading_window(headings_rad: Array, heading_rad: float | None, window_deg: float) -> NDArray[np.bool_]:
+    """References whose viewing direction is within a window of a known heading; all where none is known."""
+    if heading_rad is None:
+        return np.ones(len(headings_rad), bool)
+    difference = np.angle(np.exp(1j * (headings_rad - heading_rad)))
+    return np.abs(difference) <= np.radians(window_deg)
+
+
+def vote(query: Features, references: Sequence[Features]) -> NDArray[np.int64]:
+    """Mutual nearest neighbours that each reference has with the query: a cheap sign of common content."""
+    matcher = MutualNearest(ratio=_VOTE_RATIO)
+    return np.array([len(matcher.match(query, reference)) for reference in references], dtype=np.int64)
+
+
+def overlap(points: Array, directions: Array, views: Views, sizes: Array) -> NDArray[np.int64]:
+    """How many points (P, 3), seen by the query along unit directions (P, 3), each view can see from a similar side.
+
+    sizes: (V, 2) image width and height.
+    """
+    count = len(points)
+    out = np.zeros(len(views), np.int64)
+    for index in range(len(views)):
+        view = np.full(count, index)
+        pixel = views.project(view, points)
+        inside = ((pixel >= 0) & (pixel <= sizes[index])).all(axis=1)
+        rays = points - views.centres[index]
+        rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+        similar = np.einsum("ni,ni->n", rays, directions) >= np.cos(np.radians(_MAX_VIEWING_ANGLE_DEG))
+        out[index] = np.count_nonzero(inside & similar)
+    return out

@@ -1,0 +1,259 @@
+"""Localization of one image against the reference: `Localized | Rejected(reason)`."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import chi2
+
+from georef.config import CandidatesConfig, LocalizeConfig
+from georef.estimation.candidates import Box, in_heading_window, overlap, search_box, vote
+from georef.estimation.guided import GuidedOptions, PosedFeatures, guided_matches
+from georef.estimation.local_model import LocalModel, query_centred_model
+from georef.estimation.pnp import EstimatedPose, QueryImage, ransac_pose, refine_pose, with_covariance
+from georef.estimation.published import published_model
+from georef.estimation.reference_map import ReferenceMap
+from georef.features.base import Matcher
+from georef.geometry.covariance import position_cov_in_world
+from georef.geometry.rigid import Rigid3
+from georef.types.campaign import Image
+from georef.types.features import Features, Matches
+from georef.types.results import Localized, Outcome, ReferenceMatches, Rejected, RejectReason
+
+_PRIOR_PROBABILITY = 0.9999
+_STRONG_EVIDENCE = 3  # times min_inliers: then the images overrule a position prior
+
+
+@dataclass
+class _Work:
+    """What one localization carries along: its inputs, and how long each step took."""
+
+    image: Image
+    features: Features
+    reference: ReferenceMap
+    matcher: Matcher
+    candidates: CandidatesConfig
+    config: LocalizeConfig
+    match_keypoints: int
+    query: QueryImage = field(init=False)
+    posed: PosedFeatures = field(init=False)
+    cpu_s: dict[str, float] = field(default_factory=dict)
+    notes: list[str] = field(default_factory=list)
+    pairs: dict[int, Matches] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        self.posed = PosedFeatures.of(self.features, self.image.camera, Rigid3.identity())
+        sigma = self.reference.noise.keypoint_sigma * self.features.scales_px.astype(np.float64)
+        self.query = QueryImage(self.image.camera, self.posed.ideal_px, sigma)
+
+    def timed(self, step: str) -> _Timer:
+        return _Timer(self.cpu_s, step)
+
+
+def localize_image(
+    image: Image,
+    features: Features,
+    reference: ReferenceMap,
+    matcher: Matcher,
+    candidates: CandidatesConfig,
+    config: LocalizeConfig,
+    match_keypoints: int,
+) -> Outcome:
+    """The pose of one image with its covariance, or why there is none.
+
+    References inside the position prior's box are tried first, then the whole reference.
+    """
+    if len(features) < config.min_inliers:
+        return Rejected(image.image_id, RejectReason.FEW_FEATURES, f"{len(features)} keypoints")
+    work = _Work(image, features, reference, matcher, candidates, config, match_keypoints)
+    box = search_box(reference.positions, image.gnss, candidates)
+    outcome = _localize_in(work, box)
+    if isinstance(outcome, Rejected) and not box.whole_reference:
+        work.notes.append(
+            f"inside the search box: {outcome.reason.value} ({outcome.detail}); tried the whole reference"
+        )
+        outcome = _localize_in(work, search_box(reference.positions, None, candidates))
+    return replace(_against_prior(outcome, image, config), notes=tuple(work.notes))
+
+
+def _localize_in(work: _Work, box: Box) -> Outcome:
+    if box.note:
+        work.notes.append(box.note)
+    in_window = in_heading_window(
+        work.reference.headings_rad[box.indices], work.image.heading_rad, work.candidates.heading_window_deg
+    )
+    inside = box.indices[in_window][: work.candidates.max_searched]
+    if len(inside) < 2:
+        return Rejected(work.image.image_id, RejectReason.NO_CANDIDATES, f"{len(inside)} reference images")
+    if len(inside) < len(box.indices[in_window]):
+        work.notes.append(f"searched the nearest {len(inside)} of {len(box.indices)} references")
+    ranked = _rank_by_votes(work, inside)
+    method = _published if work.config.method == "published" else _query_centred
+    return method(work, ranked)
+
+
+def _rank_by_votes(work: _Work, indices: NDArray[np.int64]) -> NDArray[np.int64]:
+    with work.timed("candidates"):
+        count = work.candidates.vote_keypoints
+        votes = vote(work.features.head(count), [work.reference.head(int(i), count) for i in indices])
+        return indices[np.argsort(-votes, kind="stable")]
+
+
+def _query_centred(work: _Work, ranked: NDArray[np.int64]) -> Outcome:
+    """A first pose from a few references by the matcher, then guided matching in all that see the same points."""
+    first = None
+    for count in sorted({work.candidates.first_count, work.candidates.count}):
+        first = _first_pose(work, [int(i) for i in ranked[:count]])
+        if not isinstance(first, Rejected):
+            break
+    if first is None or isinstance(first, Rejected):
+        return first or Rejected(work.image.image_id, RejectReason.NO_CANDIDATES, "no reference image")
+    pose, model = first
+    chosen = _that_see(work, ranked, pose, model)
+    with work.timed("guided matching"):
+        matches = [_guided(work, pose, index) for index in chosen]
+    with work.timed("pose"):
+        references = [work.reference.posed(i) for i in chosen]
+        model = query_centred_model(references, matches, work.reference.noise.keypoint_sigma)
+        model = _thinned(model, work.config)
+        estimate = refine_pose(pose, work.query, model, lambda v: work.reference.pose_cov(chosen[v]))
+    return _outcome(work, estimate, model, chosen)
+
+
+def _first_pose(work: _Work, indices: list[int]) -> tuple[Rigid3, LocalModel] | Rejected:
+    matches = [_matched(work, index) for index in indices]
+    with work.timed("pose"):
+        references = [work.reference.posed(i) for i in indices]
+        model = query_centred_model(references, matches, work.reference.noise.keypoint_sigma)
+        if len(model) < work.config.min_inliers:
+            total = sum(len(m) for m in matches)
+            detail = f"{len(model)} points that two references agree on, of {total} matches in {len(indices)} images"
+            return Rejected(work.image.image_id, RejectReason.FEW_MATCHES, detail)
+        found = ransac_pose(work.query, model, work.config.ransac_gate_px, work.config.seed)
+        inliers = 0 if found is None else int(found[1].sum())
+        if found is None or not _enough(inliers, len(model), work.config):
+            detail = f"{inliers} of {len(model)} points agree with one pose"
+            return Rejected(work.image.image_id, RejectReason.FEW_INLIERS, detail)
+        return found[0], model.take(found[1])
+
+
+def _matched(work: _Work, index: int) -> Matches:
+    """Matches of the query with a reference by the matcher, computed once."""
+    if index not in work.pairs:
+        with work.timed("matching"):
+            reference = work.reference.posed(index).features
+            count = work.match_keypoints
+            work.pairs[index] = work.matcher.match(work.features.head(count), reference.head(count))
+    return work.pairs[index]
+
+
+def _that_see(work: _Work, ranked: NDArray[np.int64], pose: Rigid3, model: LocalModel) -> list[int]:
+    """The references that see most of the points from a similar side, at most `count`, already matched ones first."""
+    with work.timed("candidates"):
+        directions = model.points - pose.translation
+        directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+        cameras = [work.reference.images[int(i)].camera for i in ranked]
+        sizes = np.array([[c.width, c.height] for c in cameras], dtype=float)
+        seen = overlap(model.points, directions, work.reference.views([int(i) for i in ranked]), sizes)
+        order = np.argsort(-seen, kind="stable")
+        return [int(ranked[i]) for i in order[: work.candidates.count] if seen[i] > 0]
+
+
+def _guided(work: _Work, pose: Rigid3, index: int) -> Matches:
+    options = GuidedOptions(work.config.guided_gate, work.config.guided_min_similarity, work.config.guided_ratio)
+    known = work.pairs.get(index)
+    return guided_matches(work.posed.posed(pose), work.reference.posed(index), options, known)
+
+
+def _published(work: _Work, ranked: NDArray[np.int64]) -> Outcome:
+    """All pairs among the query and its candidates matched; COLMAP's triangulation from the fixed reference poses."""
+    chosen = [int(i) for i in ranked[: work.candidates.count]]
+    references = [work.reference.posed(i) for i in chosen]
+    with work.timed("matching"):
+        model = published_model(work.posed, references, work.matcher, work.match_keypoints, work.reference.noise)
+    with work.timed("pose"):
+        if len(model) < work.config.min_inliers:
+            return Rejected(work.image.image_id, RejectReason.FEW_MATCHES, f"{len(model)} triangulated points")
+        model = _thinned(model, work.config)
+        found = ransac_pose(work.query, model, work.config.ransac_gate_px, work.config.seed)
+        inliers = 0 if found is None else int(found[1].sum())
+        if found is None or not _enough(inliers, len(model), work.config):
+            detail = f"{inliers} of {len(model)} points agree with one pose"
+            return Rejected(work.image.image_id, RejectReason.FEW_INLIERS, detail)
+        estimate = with_covariance(found[0], work.query, model, found[1], lambda v: work.reference.pose_cov(chosen[v]))
+    return _outcome(work, estimate, model, chosen)
+
+
+def _enough(inliers: int, points: int, config: LocalizeConfig) -> bool:
+    return inliers >= config.min_inliers and inliers >= config.min_inlier_ratio * points
+
+
+def _thinned(model: LocalModel, config: LocalizeConfig) -> LocalModel:
+    """A random subset of the points where the configuration limits their number."""
+    if not 0 < config.max_correspondences < len(model):
+        return model
+    chosen = np.random.default_rng(config.seed).permutation(len(model))[: config.max_correspondences]
+    return model.take(np.isin(np.arange(len(model)), chosen))
+
+
+def _outcome(work: _Work, estimate: EstimatedPose | None, model: LocalModel, chosen: Sequence[int]) -> Outcome:
+    image_id = work.image.image_id
+    if estimate is None:
+        return Rejected(image_id, RejectReason.DEGENERATE, f"{len(model)} points do not fix the pose")
+    inliers = int(estimate.inliers.sum())
+    if not _enough(inliers, len(model), work.config):
+        return Rejected(image_id, RejectReason.FEW_INLIERS, f"{inliers} of {len(model)} points agree with one pose")
+    sigma = float(np.sqrt(np.linalg.eigvalsh(estimate.cov[3:, 3:])[-1]))
+    if sigma > work.config.max_position_sigma_m:
+        limit = work.config.max_position_sigma_m
+        return Rejected(image_id, RejectReason.DEGENERATE, f"position sigma {sigma:.2f} m, over {limit:g} m")
+    used = model.take(estimate.inliers)
+    return Localized(
+        image_id=image_id,
+        world_from_cam=estimate.world_from_cam,
+        world_from_cam_cov=estimate.cov,
+        correspondence_count=inliers,
+        sigma0=estimate.sigma0,
+        matches=_reference_matches(used, [work.reference.images[i].image_id for i in chosen]),
+        points_in_world=used.points,
+        keypoints=used.keypoint,
+        cpu_s=dict(work.cpu_s),
+    )
+
+
+def _reference_matches(model: LocalModel, ids: Sequence[str]) -> tuple[ReferenceMatches, ...]:
+    obs = model.observations
+    pairs = np.column_stack([model.keypoint[obs.point], obs.keypoint]).astype(np.int32)
+    return tuple(ReferenceMatches(name, pairs[obs.view == i]) for i, name in enumerate(ids) if (obs.view == i).any())
+
+
+def _against_prior(outcome: Outcome, image: Image, config: LocalizeConfig) -> Outcome:
+    """Compares a pose with the position prior: strong evidence overrules the prior, weak evidence does not."""
+    if isinstance(outcome, Rejected) or image.gnss is None:
+        return outcome
+    off = outcome.world_from_cam.translation - image.gnss.position_in_world
+    cov = image.gnss.cov + position_cov_in_world(outcome.world_from_cam, outcome.world_from_cam_cov)
+    if off @ np.linalg.solve(cov, off) <= chi2.ppf(_PRIOR_PROBABILITY, 3):
+        return outcome
+    distance = float(np.linalg.norm(off))
+    if outcome.correspondence_count < _STRONG_EVIDENCE * config.min_inliers:
+        detail = f"{outcome.correspondence_count} points put it {distance:.1f} m from its position prior"
+        return Rejected(image.image_id, RejectReason.PRIOR_CONTRADICTS, detail)
+    return replace(outcome, gnss_rejected=True, gnss_offset_m=distance)
+
+
+class _Timer:
+    """Adds the CPU seconds of a block to a step."""
+
+    def __init__(self, times: dict[str, float], step: str) -> None:
+        self.times, self.step = times, step
+
+    def __enter__(self) -> None:
+        self.start = time.process_time()
+
+    def __exit__(self, *_: object) -> None:
+        self.times[self.step] = self.times.get(self.step, 0.0) + time.process_time() - self.start

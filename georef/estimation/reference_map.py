@@ -1,0 +1,67 @@
+"""The reference as localization sees it: poses, cameras, and features read from the store when they are needed."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from georef.estimation.guided import PosedFeatures
+from georef.geometry.projection import Views
+from georef.geometry.rigid import Array, Rigid3
+from georef.types.campaign import Campaign, Image
+from georef.types.features import Features
+from georef.types.results import ReferenceNoise
+
+FeatureReader = Callable[[str, int | None], Features]
+"""Features of an image id; the second argument reads only that many of the best."""
+
+_KEPT_IMAGES = 64
+
+
+class ReferenceMap:
+    """Posed reference images with lazily read features; the most recently used ones are kept."""
+
+    def __init__(self, campaign: Campaign, read_features: FeatureReader, noise: ReferenceNoise) -> None:
+        self.images: tuple[Image, ...] = tuple(image for image in campaign.images if image.world_from_cam is not None)
+        self.poses: list[Rigid3] = [image.world_from_cam for image in self.images if image.world_from_cam is not None]
+        self.noise = noise
+        self.positions: Array = np.array([pose.translation for pose in self.poses]).reshape(-1, 3)
+        forward = np.array([pose.rotation[:, 2] for pose in self.poses]).reshape(-1, 3)
+        self.headings_rad: Array = np.arctan2(forward[:, 0], forward[:, 1])
+        self._read = read_features
+        self._heads: OrderedDict[tuple[int, int], Features] = OrderedDict()
+        self._posed: OrderedDict[int, PosedFeatures] = OrderedDict()
+
+    def __len__(self) -> int:
+        return len(self.images)
+
+    def head(self, index: int, count: int) -> Features:
+        """The best `count` features of a reference image."""
+        return _remember(self._heads, (index, count), 4096, lambda: self._read(self.images[index].image_id, count))
+
+    def posed(self, index: int) -> PosedFeatures:
+        """All features of a reference image with its pose."""
+        image = self.images[index]
+        return _remember(
+            self._posed,
+            index,
+            _KEPT_IMAGES,
+            lambda: PosedFeatures.of(self._read(image.image_id, None), image.camera, self.poses[index]),
+        )
+
+    def views(self, indices: Sequence[int]) -> Views:
+        return Views.of([self.poses[i] for i in indices], [self.images[i].camera for i in indices])
+
+    def pose_cov(self, index: int) -> Array:
+        return self.noise.pose_cov(self.poses[index])
+
+
+def _remember(cache: OrderedDict, key: object, size: int, make: Callable):
+    if key not in cache:
+        cache[key] = make()
+        if len(cache) > size:
+            cache.popitem(last=False)
+    cache.move_to_end(key)
+    return cache[key]

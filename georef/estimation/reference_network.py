@@ -1,0 +1,207 @@
+"""The reference judged by itself: how well its poses and keypoints agree with each other.
+
+Reference images are matched along their epipolar lines and adjusted with their given exterior orientations as
+weighted observations; variance components of keypoints, positions and rotations follow from the residuals. What is
+common to the whole reference (a shift, a turn) leaves no residual and is not observable here.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from georef.config import AdjustConfig, NetworkConfig
+from georef.errors import StageError
+from georef.estimation.adjustment.adjust import Adjusted, adjust
+from georef.estimation.adjustment.components import Component
+from georef.estimation.adjustment.gate import worst_orientation
+from georef.estimation.adjustment.posterior import posterior
+from georef.estimation.adjustment.problem import Orientation, Problem
+from georef.estimation.guided import GuidedOptions, PosedFeatures, epipolar_band, guided_matches
+from georef.estimation.tracks import PairMatches, build_tracks, distributed, select_points, triangulated_tracks
+from georef.executor import Progress
+from georef.features.nearest import MutualNearest
+from georef.geometry.rigid import Array
+from georef.types.results import ReferenceNoise
+
+_VOTERS = 512
+_START_POSITION_M, _START_ROTATION_RAD, START_KEYPOINT = 0.01, 3e-4, 0.5
+_LEAST_POSITION_M, _LEAST_ROTATION_RAD = 1e-4, 1e-6
+_ROUNDS, _SETTLED = 10, 0.03
+_LEAST_POINTS = 30
+
+
+@dataclass(frozen=True, eq=False)
+class NetworkResult:
+    noise: ReferenceNoise
+    components: dict[str, Component]  # of the last round, factors near 1 where they were estimated
+    suspects: tuple[int, ...]  # images whose given orientation contradicts the others
+    images: int
+    points: int
+    observations: int
+
+
+def choose_images(positions: Array, limit: int) -> NDArray[np.int64]:
+    """At most `limit` images that lie together: those nearest to the image nearest to the middle."""
+    if len(positions) <= limit:
+        return np.arange(len(positions))
+    middle = np.linalg.norm(positions - np.median(positions, axis=0), axis=1).argmin()
+    return np.sort(np.linalg.norm(positions - positions[middle], axis=1).argsort(kind="stable")[:limit])
+
+
+def match_network(
+    images: Sequence[PosedFeatures],
+    neighbours: int,
+    options: GuidedOptions,
+    progress: Progress,
+) -> list[PairMatches]:
+    """Guided matches of each image with the others that share most content with it under the known geometry."""
+    votes = _pair_votes(images, options.gate)
+    pairs = {
+        (min(i, int(j)), max(i, int(j)))
+        for i in range(len(images))
+        for j in np.argsort(-votes[i], kind="stable")[:neighbours]
+        if votes[i, j] > 0
+    }
+    progress.begin("network", len(pairs))
+    out = []
+    for i, j in sorted(pairs):
+        out.append(PairMatches(i, j, guided_matches(images[i], images[j], options).indices))
+        progress.advance()
+    progress.end()
+    return out
+
+
+def _pair_votes(images: Sequence[PosedFeatures], gate: float) -> NDArray[np.int64]:
+    """Mutual nearest neighbours among the best features that also lie on each other's epipolar lines."""
+    matcher = MutualNearest(ratio=0.95)
+    heads = [_head(image, _VOTERS) for image in images]
+    votes = np.zeros((len(images), len(images)), np.int64)
+    for i in range(len(images)):
+        for j in range(i):
+            pairs = matcher.match(heads[i].features, heads[j].features).indices
+            band = epipolar_band(heads[i], heads[j], gate)
+            votes[i, j] = votes[j, i] = int(band[pairs[:, 0], pairs[:, 1]].sum())
+    return votes
+
+
+def _head(image: PosedFeatures, count: int) -> PosedFeatures:
+    return replace(image, features=image.features.head(count), ideal_px=image.ideal_px[:count])
+
+
+def estimate_noise(
+    images: Sequence[PosedFeatures],
+    matches: Sequence[PairMatches],
+    config: NetworkConfig,
+    adjust_config: AdjustConfig,
+    declared: ReferenceNoise | None,
+) -> NetworkResult:
+    """Sigmas of keypoints, and of reference positions and rotations where they are not declared.
+
+    Raises StageError where the reference images share too little to say.
+    """
+    noise = declared or ReferenceNoise(
+        START_KEYPOINT, (_START_POSITION_M,) * 3, (_START_ROTATION_RAD,) * 3, "estimated"
+    )
+    problem = _problem(images, matches, config, noise)
+    suspects: list[int] = []
+    while True:
+        noise, adjusted = _iterated(problem, noise, adjust_config, estimate_poses=declared is None)
+        cofactors = posterior(adjusted.problem, adjusted.solution)
+        worst = worst_orientation(adjusted.problem, adjusted.solution, cofactors, adjust_config.gate_probability)
+        if worst is None or len(suspects) >= config.max_suspect_share * len(images):
+            break
+        suspects.append(worst)
+        problem = _without_orientation(_continued(adjusted, noise), worst)
+    return NetworkResult(
+        noise,
+        adjusted.components,
+        tuple(suspects),
+        len(images),
+        len(adjusted.problem.points),
+        len(adjusted.problem.observations),
+    )
+
+
+def _iterated(
+    problem: Problem, noise: ReferenceNoise, adjust_config: AdjustConfig, *, estimate_poses: bool
+) -> tuple[ReferenceNoise, Adjusted]:
+    """Adjusts and scales the sigmas by their components until these settle near 1."""
+    for _ in range(_ROUNDS):
+        adjusted = adjust(_with_noise(problem, noise), adjust_config)
+        noise, change = _updated(noise, adjusted, estimate_poses=estimate_poses)
+        problem = _continued(adjusted, noise)
+        if change < _SETTLED:
+            break
+    return noise, adjusted
+
+
+def _without_orientation(problem: Problem, index: int) -> Problem:
+    return replace(problem, orientations={i: o for i, o in problem.orientations.items() if i != index})
+
+
+def _problem(
+    images: Sequence[PosedFeatures], matches: Sequence[PairMatches], config: NetworkConfig, noise: ReferenceNoise
+) -> Problem:
+    count, observations = build_tracks(images, matches, noise.keypoint_sigma)
+    covs = [noise.pose_cov(image.world_from_cam) for image in images]
+    points, observations = triangulated_tracks(count, observations, images, covs)
+    sizes = np.array([[image.camera.width, image.camera.height] for image in images], dtype=float)
+    keep = distributed(observations, sizes, np.ones(len(images), bool), config.max_points_per_image)
+    points, observations = select_points(points, observations, keep)
+    if len(points) < _LEAST_POINTS:
+        raise StageError(
+            f"The reference images share only {len(points)} points, too few to estimate the reference's sigma.",
+            f"Expected at least {_LEAST_POINTS} points seen by two or more reference images.",
+            "Declare it in project.toml: [reference] sigma = { position_m = [...], rotation_deg = [...] }.",
+        )
+    return Problem(
+        image_ids=tuple(str(i) for i in range(len(images))),
+        cameras=tuple(image.camera for image in images),
+        world_from_cams=tuple(image.world_from_cam for image in images),
+        points=points,
+        observations=observations,
+        orientations={i: _orientation(image, noise) for i, image in enumerate(images)},
+    )
+
+
+def _orientation(image: PosedFeatures, noise: ReferenceNoise) -> Orientation:
+    return Orientation(image.world_from_cam, np.array(noise.position_sigma_m), np.array(noise.rotation_sigma_rad))
+
+
+def _with_noise(problem: Problem, noise: ReferenceNoise) -> Problem:
+    orientations = {
+        i: Orientation(o.world_from_cam, np.array(noise.position_sigma_m), np.array(noise.rotation_sigma_rad))
+        for i, o in problem.orientations.items()
+    }
+    return replace(problem, orientations=orientations)
+
+
+def _continued(adjusted: Adjusted, noise: ReferenceNoise) -> Problem:
+    problem = adjusted.problem.with_poses(adjusted.solution.world_from_cams, adjusted.solution.points)
+    return _with_noise(problem, noise)
+
+
+def _updated(noise: ReferenceNoise, adjusted: Adjusted, *, estimate_poses: bool) -> tuple[ReferenceNoise, float]:
+    """The sigmas times the square roots of their components, and the largest relative change."""
+    position = adjusted.components["reference_position"].factor if estimate_poses else 1.0
+    rotation = adjusted.components["reference_rotation"].factor if estimate_poses else 1.0
+    if position is None or rotation is None:
+        raise StageError(
+            "The reference images overlap too little to estimate the sigma of their exterior orientation.",
+            "Declare it in project.toml: [reference] sigma = { position_m = [...], rotation_deg = [...] }.",
+        )
+    new_position = max(noise.position_sigma_m[0] * position, _LEAST_POSITION_M)
+    new_rotation = max(noise.rotation_sigma_rad[0] * rotation, _LEAST_ROTATION_RAD)
+    change = max(
+        abs(adjusted.sigma_scale - 1.0),
+        abs(new_position / noise.position_sigma_m[0] - 1.0) if estimate_poses else 0.0,
+        abs(new_rotation / noise.rotation_sigma_rad[0] - 1.0) if estimate_poses else 0.0,
+    )
+    updated = replace(noise, keypoint_sigma=noise.keypoint_sigma * adjusted.sigma_scale)
+    if estimate_poses:
+        updated = replace(updated, position_sigma_m=(new_position,) * 3, rotation_sigma_rad=(new_rotation,) * 3)
+    return updated, change

@@ -1,0 +1,1 @@
+"""Local features: extractors, matchers, and the weights of the learned ones."""

@@ -1,0 +1,71 @@
+"""Positions of images by GNSS, with their standard deviations and, where there is one, a heading."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from georef.geometry.rigid import Array
+from georef.io.columns import SIGMA_COLUMNS, CrsKind, PositionTable, read_positions, read_sigmas, require_columns
+from georef.io.tables import Table, TableFormat, read_table
+
+
+@dataclass(frozen=True, eq=False)
+class GnssTable(PositionTable):
+    """Measured positions of N images: see PositionTable, and
+
+    heading_deg: of the optical axis, clockwise from north, NaN where it is empty or the file has no such column.
+    """
+
+    image_ids: tuple[str, ...]
+    sigmas_m: Array  # (N, 3) m along the axes of the CRS (geographic: east, north, up)
+    heading_deg: Array  # (N,)
+
+
+def read_gnss(
+    path: Path | str,
+    *,
+    crs_kind: CrsKind,
+    columns: Mapping[str, str] | None = None,
+    table_format: TableFormat | None = None,
+) -> GnssTable:
+    """Read image, position, three sigmas (m) and optionally heading_deg.
+
+    Raises InputError for columns that are missing, values that cannot be, sigmas that are not positive, and images
+    that are listed twice.
+    """
+    table = read_table(path, columns=columns, table_format=table_format)
+    require_columns(table, crs_kind, ("image", *SIGMA_COLUMNS[crs_kind]))
+    image_ids = table.unique_ids("image")
+    return GnssTable(
+        path=table.path,
+        declared=table.declared,
+        rows=table.rows,
+        positions_in_crs=read_positions(table, crs_kind),
+        image_ids=image_ids,
+        sigmas_m=read_sigmas(
+            table,
+            SIGMA_COLUMNS[crs_kind],
+            lambda i: f"The position of image {image_ids[i]!r}",
+            expected="a positive standard deviation in metres (RTK: 0.02 to 0.05; single receiver: 1 to 5).",
+            remedy=lambda _: "Correct the value, or delete the row if the image has no GNSS position.",
+        ),
+        heading_deg=_headings(table),
+    )
+
+
+def _headings(table: Table) -> Array:
+    if not table.has("heading_deg"):
+        return np.full(len(table), np.nan)
+    headings = table.numbers("heading_deg", allow_empty=True)
+    for i in np.flatnonzero(np.abs(headings) > 360.0)[:1]:
+        raise table.error(
+            int(i),
+            f"Column 'heading_deg' has {headings[i]}.",
+            expected="degrees clockwise from north, between -360 and 360.",
+            remedy="Correct the value, or leave it empty.",
+        )
+    return headings

@@ -1,0 +1,204 @@
+"""Stage order, fingerprints, run, resume and status.
+
+A stage's fingerprint hashes its version, its sections of the configuration, what it reads, and the fingerprints of the
+stages before it. Same fingerprint: done work is kept. Different: a new folder; nothing is overwritten.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from georef.executor import Executor
+from georef.io.files import write_text_atomically
+from georef.project import Project
+from georef.stages import adjust, features, localize, network, report
+from georef.stages.base import Meter, Run, StageContext, StageSummary
+from georef.stages.survey import Survey, load_survey
+from georef.types.campaign import Campaign
+
+DONE = "stage.json"
+BEGUN = "fingerprint.json"
+
+
+@dataclass(frozen=True)
+class Stage:
+    """A step of the common route."""
+
+    name: str
+    version: int  # raise it when the same inputs give other results
+    sections: tuple[str, ...]  # of the configuration
+    reads: Callable[[Project, Survey], dict[str, Any]]
+    needs: tuple[str, ...]  # stages before it
+    run: Run
+
+
+def _reference_files(project: Project, survey: Survey) -> dict[str, Any]:
+    return {
+        "crs": project.file.crs.model_dump(),
+        "reference": project.file.reference.model_dump(),
+        "reference tables": _digest(survey.reference),
+    }
+
+
+def _epoch_files(project: Project, survey: Survey) -> dict[str, Any]:
+    return {"epoch tables": _digest(survey.epoch)}
+
+
+def _all_images(project: Project, survey: Survey) -> dict[str, Any]:
+    states = [_state(image.path) for campaign in (survey.reference, survey.epoch) for image in campaign.images]
+    return {"images": _hash(states)}
+
+
+def _control(project: Project, survey: Survey) -> dict[str, Any]:
+    return {"control points": _hash([_plain(p) for p in survey.control])}
+
+
+def _check(project: Project, survey: Survey) -> dict[str, Any]:
+    return {"check points": _hash([_plain(p) for p in survey.check]), **_reference_files(project, survey)}
+
+
+STAGES: tuple[Stage, ...] = (
+    Stage("features", 1, ("features",), _all_images, (), features.run),
+    Stage("network", 1, ("network", "localize", "adjust"), _reference_files, ("features",), network.run),
+    Stage("localize", 1, ("matching", "candidates", "localize"), _epoch_files, ("features", "network"), localize.run),
+    Stage("adjust", 1, ("adjust", "localize"), _control, ("features", "network", "localize"), adjust.run),
+    Stage("report", 1, ("report",), _check, ("features", "network", "localize", "adjust"), report.run),
+)
+
+
+@dataclass(frozen=True)
+class StageState:
+    """What is known of a stage without running it."""
+
+    stage: str
+    state: str  # "done", "partial", "stale" or "new"
+    why: str
+    folder: Path
+
+
+@dataclass(frozen=True)
+class StageResult:
+    """What running a stage gave: `reused` when all of it was there."""
+
+    stage: str
+    summary: StageSummary
+    timing: dict[str, float]
+    reused: bool
+
+
+def run_pipeline(project: Project, epoch: str, executor: Executor) -> Iterator[StageResult]:
+    """Runs what is not done, stage by stage. Raises GeorefError."""
+    survey = load_survey(project, epoch)
+    for stage, folder, parts, before in _plan(project, epoch, survey):
+        yield _run_stage(stage, StageContext(project, project.config, epoch, survey, executor, folder, before), parts)
+
+
+def status(project: Project, epoch: str) -> list[StageState]:
+    """The state of every stage: done, partial, stale (and why), or new."""
+    survey = load_survey(project, epoch)
+    return [
+        _state_of(project, epoch, stage, folder, parts) for stage, folder, parts, _ in _plan(project, epoch, survey)
+    ]
+
+
+def _plan(
+    project: Project, epoch: str, survey: Survey
+) -> Iterator[tuple[Stage, Path, dict[str, Any], dict[str, Path]]]:
+    """Each stage with its folder, the parts of its fingerprint, and the folders of the stages before it."""
+    prints: dict[str, str] = {}
+    version = features.extractor_version(project.config.features)
+    before = {"store": project.feature_folder / _hash(version)[:12]}
+    for stage in STAGES:
+        parts = {
+            "stage version": stage.version,
+            "components": version if stage.name == "features" else localize.components(project.config, stage.name),
+            **{f"[{name}]": getattr(project.config, name).model_dump() for name in stage.sections},
+            **stage.reads(project, survey),
+            **{f"stage {name}": prints[name] for name in stage.needs},
+        }
+        prints[stage.name] = _hash(parts)[:12]
+        folder = project.stage_folder(epoch, stage.name, prints[stage.name])
+        yield stage, folder, parts, dict(before)
+        before[stage.name] = folder
+
+
+def _run_stage(stage: Stage, context: StageContext, parts: dict[str, Any]) -> StageResult:
+    done = _read_json(context.folder / DONE)
+    if done is not None and report.outputs_exist(context, stage.name):
+        summary = StageSummary(done["line"], done["data"], 0, done["total"])
+        return StageResult(stage.name, summary, done["timing"], reused=True)
+    context.folder.mkdir(parents=True, exist_ok=True)
+    write_text_atomically(json.dumps(parts, indent=1), context.folder / BEGUN)
+    meter = Meter()
+    summary = stage.run(context)
+    timing = meter.read()
+    record = {
+        "stage": stage.name,
+        "line": summary.line,
+        "data": summary.data,
+        "computed": summary.computed,
+        "total": summary.total,
+        "timing": timing,
+        "finished": time.strftime("%Y-%m-%dT%H:%M:%S%z"),
+    }
+    write_text_atomically(json.dumps(record, indent=1), context.folder / DONE)
+    return StageResult(stage.name, summary, timing, reused=False)
+
+
+def _state_of(project: Project, epoch: str, stage: Stage, folder: Path, parts: dict[str, Any]) -> StageState:
+    if (folder / DONE).is_file():
+        return StageState(stage.name, "done", "", folder)
+    if folder.is_dir():
+        items = len(list((folder / localize.ITEMS).glob("*.npz"))) if (folder / localize.ITEMS).is_dir() else 0
+        return StageState(
+            stage.name, "partial", f"interrupted; {items} items are kept" if items else "interrupted", folder
+        )
+    older = [p for p in project.stage_history(epoch, stage.name) if (p / BEGUN).is_file()]
+    if not older:
+        return StageState(stage.name, "new", "", folder)
+    before = _read_json(older[-1] / BEGUN) or {}
+    changed = [key for key in {**before, **parts} if before.get(key) != parts.get(key)]
+    return StageState(stage.name, "stale", f"changed: {', '.join(changed)}", folder)
+
+
+def _digest(campaign: Campaign) -> str:
+    """A hash of all that the tables say of the images of a campaign."""
+    return _hash([_plain(image) for image in campaign.images])
+
+
+def _plain(value: Any) -> Any:
+    """A value as JSON: dataclasses as their fields, arrays as lists, paths by their name."""
+    if hasattr(value, "__dataclass_fields__"):
+        return {name: _plain(getattr(value, name)) for name in value.__dataclass_fields__}
+    if hasattr(value, "tolist"):
+        return value.tolist()
+    if isinstance(value, Path):
+        return value.name
+    if isinstance(value, (tuple, list)):
+        return [_plain(v) for v in value]
+    return value
+
+
+def _state(path: Path) -> list[Any]:
+    try:
+        status = path.stat()
+    except OSError:
+        return [path.name, None, None]
+    return [path.name, status.st_size, status.st_mtime_ns]
+
+
+def _hash(value: Any) -> str:
+    return hashlib.sha256(json.dumps(value, sort_keys=True, default=str).encode()).hexdigest()
+
+
+def _read_json(path: Path) -> dict[str, Any] | None:
+    try:
+        return json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return None

@@ -1,0 +1,189 @@
+"""A project on disk: `project.toml`, its data root, and where results go. The only module that knows folder names."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+from pydantic import Field, field_validator, model_validator
+
+from georef.config import Config, Section, load_config, merge, parse_overrides, read_toml, validated
+from georef.errors import ConfigError
+
+PROJECT_FILE = "project.toml"
+AngleConvention = Literal["omega-phi-kappa", "yaw-pitch-roll"]
+AngleUnit = Literal["deg", "gon", "rad"]
+
+
+class CrsSection(Section):
+    horizontal: str
+    height: str | None = None
+    origin: tuple[float, float, float] | None = None
+
+
+class TableSection(Section):
+    """How a table is written, where detection is not enough."""
+
+    delimiter: str | None = None
+    decimal: Literal[".", ","] | None = None
+    encoding: str | None = None
+    columns: dict[str, str] = {}
+
+
+class ReferenceSigma(Section):
+    position_m: tuple[float, float, float]
+    rotation_deg: tuple[float, float, float]
+
+    @field_validator("position_m", "rotation_deg")
+    @classmethod
+    def _positive(cls, value: tuple[float, float, float]) -> tuple[float, float, float]:
+        if min(value) <= 0:
+            raise ValueError("each 1-sigma must be positive; a reference is never exact")
+        return value
+
+
+class ReferenceSection(Section):
+    images: str
+    cameras: str | None = None
+    exterior_orientation: str
+    angles: AngleConvention
+    angle_unit: AngleUnit
+    sigma: Literal["estimate"] | ReferenceSigma = "estimate"
+    unmatched: Literal["refuse", "skip"] = "refuse"
+    table: TableSection = TableSection()
+
+
+class EpochSection(Section):
+    images: str
+    cameras: str
+    gnss: str | None = None
+    table: TableSection = TableSection()
+
+
+class PointsSection(Section):
+    coordinates: str
+    marks: dict[str, str]
+    check_kind: Literal["absolute", "relative"]
+    table: TableSection = TableSection()
+
+
+class ProjectFile(Section):
+    """The content of project.toml."""
+
+    name: str = Field(min_length=1)
+    crs: CrsSection
+    reference: ReferenceSection
+    epochs: dict[str, EpochSection] = Field(min_length=1)
+    points: PointsSection | None = None
+    preset: str = "default"
+    config: dict[str, Any] = {}
+
+    @field_validator("epochs")
+    @classmethod
+    def _epoch_names(cls, epochs: dict[str, EpochSection]) -> dict[str, EpochSection]:
+        for name in epochs:
+            if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_.-]*", name) or name == "reference":
+                raise ValueError(f"the epoch name '{name}' must be letters, digits, '_', '.', '-', and not 'reference'")
+        return epochs
+
+    @model_validator(mode="after")
+    def _marks_name_epochs(self) -> ProjectFile:
+        unknown = set(self.points.marks) - set(self.epochs) if self.points else set()
+        if unknown:
+            raise ValueError(f"points.marks names epochs that do not exist: {', '.join(sorted(unknown))}")
+        return self
+
+
+@dataclass(frozen=True)
+class Project:
+    """A project opened for one run: declarations, configuration, and folders."""
+
+    file: ProjectFile
+    config: Config
+    folder: Path
+    data_root: Path
+    output: Path
+
+    def data(self, name: str) -> Path:
+        """A file that the project declares, relative to the data root."""
+        return self.data_root / name
+
+    def stage_folder(self, epoch: str, stage: str, fingerprint: str) -> Path:
+        return self.output / "work" / epoch / stage / fingerprint
+
+    def stage_history(self, epoch: str, stage: str) -> list[Path]:
+        """Folders of all runs of a stage, oldest first."""
+        parent = self.output / "work" / epoch / stage
+        return sorted((p for p in parent.glob("*") if p.is_dir()), key=lambda p: p.stat().st_mtime)
+
+    @property
+    def feature_folder(self) -> Path:
+        return self.output / "work" / "features"
+
+    def published(self, epoch: str) -> Path:
+        return self.output / "epochs" / epoch
+
+    def select_epoch(self, epoch: str | None) -> str:
+        """The epoch that is named, or the only one there is."""
+        names = list(self.file.epochs)
+        if epoch is None and len(names) == 1:
+            return names[0]
+        if epoch not in names:
+            raise ConfigError(
+                f"There is no epoch '{epoch}'." if epoch else "The project has several epochs.",
+                f"Name one with --epoch: {', '.join(names)}.",
+            )
+        return epoch
+
+
+def open_project(
+    where: Path,
+    *,
+    data: Path | None = None,
+    output: Path | None = None,
+    preset: str | None = None,
+    settings: tuple[str, ...] = (),
+) -> Project:
+    """Reads and validates a project (its folder or its project.toml). Raises ConfigError.
+
+    The data root is `data`, else GEOREF_DATA (either may also be its parent), else the project's folder.
+    """
+    path = where / PROJECT_FILE if where.is_dir() or not where.suffix else where
+    if not path.is_file():
+        raise ConfigError(f"There is no project at {where}.\nExpected {PROJECT_FILE} there; `georef init` writes one.")
+    project_layer, config_layer = _split_overrides(parse_overrides(settings))
+    file = validated(ProjectFile, merge(read_toml(path), project_layer), str(path))
+    config = load_config(preset or file.preset, (file.config, config_layer))
+    folder = path.parent.resolve()
+    return Project(
+        file=file,
+        config=config,
+        folder=folder,
+        data_root=_data_root(file, folder, data),
+        output=(output or folder).resolve(),
+    )
+
+
+def _split_overrides(overrides: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Sections of project.toml and sections of the configuration have different names; anything else is the latter."""
+    project = {key: value for key, value in overrides.items() if key in ProjectFile.model_fields}
+    return project, {key: value for key, value in overrides.items() if key not in project}
+
+
+def _data_root(file: ProjectFile, folder: Path, data: Path | None) -> Path:
+    """The named folder, or its sub-folder of the project's name, whichever holds the reference's exterior orientation."""
+    environment = os.environ.get("GEOREF_DATA")
+    named = data or (Path(environment) if environment else None)
+    tried = [named, named / folder.name] if named else [folder]
+    for root in tried:
+        if (root / file.reference.exterior_orientation).is_file():
+            return root.resolve()
+    raise ConfigError(
+        f"The data of project '{file.name}' were not found.\n"
+        f"Expected {file.reference.exterior_orientation} in {' or '.join(str(root) for root in tried)}.\n"
+        "Name the folder with --data DIR or in the environment variable GEOREF_DATA."
+    )

@@ -1,0 +1,156 @@
+"""report.json: what a surveyor asks of an adjustment, as plain values. Residuals are estimated minus reference."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from georef.evaluation.check_points import CheckPointError, CheckPointErrors, CheckPointReport, CheckPointSummary
+from georef.geometry.rigid import Array
+from georef.types.constraints import CheckKind
+from georef.types.results import Localized, Outcome, Rejected
+
+SCHEMA = 1
+_NO_CHECK = {"count": 0, "kind": None, "rmse_e_m": None, "rmse_n_m": None, "rmse_h_m": None, "rmse_3d_m": None}
+
+
+@dataclass(frozen=True, eq=False)
+class ReportInput:
+    """All that the report is made of."""
+
+    project: str
+    epoch: str
+    version: str
+    fingerprint: str
+    config: dict[str, Any]
+    world: dict[str, Any]
+    outcomes: tuple[Outcome, ...]
+    adjustment: dict[str, Any]
+    network: dict[str, Any]
+    check_before: CheckPointReport  # with the poses straight after PnP
+    check_after: CheckPointReport
+    axes_from_world: Mapping[str, Array]  # by point id: (3, 3) world axes to CRS axes
+    surveyed_control: bool
+    control_ids: tuple[str, ...]
+    timings: dict[str, Any]
+
+
+def build_report(given: ReportInput) -> dict[str, Any]:
+    """The report of one epoch as JSON values, free of NaN and infinity."""
+    localized = [o for o in given.outcomes if isinstance(o, Localized)]
+    after = _check_section(given.check_after, given)
+    return {
+        "schema": SCHEMA,
+        "project": given.project,
+        "epoch": given.epoch,
+        "georef_version": given.version,
+        "fingerprint": given.fingerprint,
+        "crs": given.world,
+        "images": {
+            "total": len(given.outcomes),
+            "localized": len(localized),
+            "rejected": len(given.outcomes) - len(localized),
+            "by_image": [_image(o, given.adjustment) for o in given.outcomes],
+        },
+        "reference": given.network,
+        "constraints": {
+            "kind": given.config["adjust"]["constraints"],
+            "automatic_gcps": given.adjustment.get("automatic_gcps", 0),
+            "tie_points": given.adjustment.get("tie_points", 0),
+            "image_observations": given.adjustment.get("image_observations", 0),
+            "gnss_positions": given.adjustment.get("gnss_positions", 0),
+            "pose_priors": given.adjustment.get("pose_priors", 0),
+            "surveyed_control_used": given.surveyed_control,
+        },
+        "check_points": after,
+        "check_points_after_pnp": _check_section(given.check_before, given),
+        "control_points": _control_section(given),
+        "gates": given.adjustment.get("gates", {}),
+        "variance_components": given.adjustment.get("variance_components", {}),
+        "adjustment": {key: given.adjustment.get(key) for key in ("iterations", "converged", "image_sigma_scale")},
+        "timings": given.timings,
+        "config": given.config,
+    }
+
+
+def _image(outcome: Outcome, adjustment: dict[str, Any]) -> dict[str, Any]:
+    if isinstance(outcome, Rejected):
+        return {
+            "image": outcome.image_id,
+            "status": "rejected",
+            "reason": outcome.reason.value,
+            "detail": outcome.detail,
+            "notes": list(outcome.notes),
+        }
+    position_cov = (
+        outcome.world_from_cam.rotation @ outcome.world_from_cam_cov[3:, 3:] @ outcome.world_from_cam.rotation.T
+    )
+    return {
+        "image": outcome.image_id,
+        "status": "localized",
+        "correspondences": outcome.correspondence_count,
+        "references": len(outcome.matches),
+        "sigma0": outcome.sigma0,
+        "pnp_sigma_m": np.sqrt(np.diag(position_cov)).tolist(),
+        "gnss_rejected": outcome.gnss_rejected,
+        "gnss_offset_m": outcome.gnss_offset_m,
+        "notes": list(outcome.notes),
+        "cpu_s": outcome.cpu_s,
+        "adjustment": adjustment.get("images_used", {}).get(outcome.image_id),
+    }
+
+
+def _check_section(report: CheckPointReport, given: ReportInput) -> dict[str, Any]:
+    """Each kind apart; the first levels repeat the absolute kind if there is one, else the relative."""
+    errors = _in_crs_axes(report.errors, given.axes_from_world)
+    summaries = errors.summarize()
+    if not summaries:
+        return {**_NO_CHECK, "by_kind": {}, "points": [], "not_determined": []}
+    main = next(kind for kind in (CheckKind.ABSOLUTE, CheckKind.RELATIVE) if kind in summaries)
+    estimated = report.summaries_estimated or {}
+    return {
+        **summaries[main].to_dict(),
+        "by_kind": {kind.value: _with_nees(summary, estimated.get(kind)) for kind, summary in summaries.items()},
+        "points": [error.to_dict() for error in errors.determined],
+        "not_determined": [entry.to_dict() for entry in errors.not_determined],
+        "mark_sigma": report.component.to_dict(),
+        "nees_with_estimated_mark_sigma": estimated[main].nees.to_dict() if main in estimated else None,
+        "residual": "estimated minus reference, along the axes of the CRS",
+    }
+
+
+def _with_nees(summary: CheckPointSummary, estimated: CheckPointSummary | None) -> dict[str, Any]:
+    nees = None if estimated is None else estimated.nees.to_dict()
+    return {**summary.to_dict(), "nees_with_estimated_mark_sigma": nees}
+
+
+def _in_crs_axes(errors: CheckPointErrors, axes: Mapping[str, Array]) -> CheckPointErrors:
+    return replace(errors, determined=tuple(_turned(error, axes[error.point_id]) for error in errors.determined))
+
+
+def _turned(error: CheckPointError, turn: Array) -> CheckPointError:
+    cov = None if error.predicted_cov is None else turn @ error.predicted_cov @ turn.T
+    return replace(error, difference_m=turn @ error.difference_m, predicted_cov=cov)
+
+
+def _control_section(given: ReportInput) -> dict[str, Any]:
+    """Control apart from check: residuals of the points that took part, in CRS axes."""
+    points = []
+    for entry in given.adjustment.get("control", []):
+        turn = given.axes_from_world[entry["point"]]
+        points.append({**entry, "residual_m": (turn @ entry["residual_m"]).tolist()})
+    residuals = np.array([p["residual_m"] for p in points]).reshape(-1, 3)
+    section: dict[str, Any] = {
+        "used": given.surveyed_control,
+        "available": len(given.control_ids),
+        "count": len(points),
+        "points": points,
+    }
+    if len(points):
+        square = np.square(residuals).mean(axis=0)
+        e, n, h = np.sqrt(square).tolist()
+        section |= {"rmse_e_m": e, "rmse_n_m": n, "rmse_h_m": h, "rmse_3d_m": float(np.sqrt(square.sum()))}
+    return section

@@ -1,0 +1,66 @@
+"""Stage `features`: local features of all reference and new images, into the feature store."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+from georef.config import FeaturesConfig
+from georef.features.base import Extractor, extract_features
+from georef.features.images import UnreadableImage, read_image
+from georef.features.registry import EXTRACTORS, load_component
+from georef.stages.base import StageContext, StageSummary, feature_id
+from georef.store.feature_store import FeatureStore
+from georef.types.campaign import Image
+from georef.types.results import RejectReason
+
+
+@dataclass
+class ExtractTask:
+    """Extracts and stores the features of one image; returns why it could not, or None."""
+
+    folder: Path
+    version: str
+    config: FeaturesConfig
+
+    @cached_property
+    def extractor(self) -> Extractor:
+        return load_component(EXTRACTORS, self.config.extractor)
+
+    def __call__(self, image: Image) -> tuple[str, str] | None:
+        try:
+            pixels = read_image(image.path)
+        except UnreadableImage as error:
+            return RejectReason.UNREADABLE.value, error.problem
+        camera, size = image.camera, (pixels.shape[1], pixels.shape[0])
+        if size != (camera.width, camera.height):
+            problem = f"the image has {size[0]} x {size[1]} px, its camera {camera.width} x {camera.height}"
+            return RejectReason.WRONG_SIZE.value, problem
+        features = extract_features(self.extractor, pixels, self.config.longest_side_px, self.config.max_keypoints)
+        FeatureStore(self.folder, extractor_version=self.version).write(feature_id(image), features, image.path)
+        return None
+
+
+def run(context: StageContext) -> StageSummary:
+    """Extracts what is not yet in the store; an image that cannot be read is listed, never fatal."""
+    images = [*context.survey.reference.images, *context.survey.epoch.images]
+    version = extractor_version(context.config.features)
+    folder = context.before["store"]
+    store = FeatureStore(folder, extractor_version=version)
+    pending = [image for image in images if not store.has(feature_id(image), image.path)]
+    task = ExtractTask(folder, version, context.config.features)
+    failed = {
+        feature_id(image): failure
+        for image, failure in zip(pending, context.executor.map_items(task, pending, "features"), strict=True)
+        if failure is not None
+    }
+    line = f"{len(images) - len(failed)} of {len(images)} images have features"
+    unreadable = f"; not usable: {', '.join(sorted(failed))}" if failed else ""
+    return StageSummary(line + unreadable, {"failed": failed}, len(pending) - len(failed), len(images))
+
+
+def extractor_version(config: FeaturesConfig) -> str:
+    """What decides the features beside the image: the component, its weights and settings, level and budget."""
+    version = load_component(EXTRACTORS, config.extractor).version()
+    return f"{version}; longest side {config.longest_side_px}; at most {config.max_keypoints}"

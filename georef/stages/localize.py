@@ -1,0 +1,124 @@
+"""Stage `localize`: every image of the epoch against the reference; each gets an outcome."""
+
+from __future__ import annotations
+
+import json
+import logging
+from collections import Counter
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+
+from georef.config import Config
+from georef.errors import StageError
+from georef.estimation.localization import localize_image
+from georef.estimation.reference_map import ReferenceMap
+from georef.features.base import Matcher
+from georef.features.registry import MATCHERS, load_component
+from georef.io.items import item_ids, item_path, read_outcome, write_outcome
+from georef.stages.base import StageContext, StageSummary, feature_id, open_features
+from georef.stages.network import read_noise
+from georef.types.campaign import Campaign, Image
+from georef.types.features import Features
+from georef.types.results import Localized, Outcome, ReferenceNoise, Rejected, RejectReason
+
+ITEMS = "items"
+logger = logging.getLogger(__name__)
+
+
+@dataclass
+class LocalizeTask:
+    """Localizes one image; what goes wrong with it is its outcome."""
+
+    reference: Campaign
+    noise: ReferenceNoise
+    store_folder: Path
+    config: Config
+    failed: dict[str, tuple[str, str]]
+
+    @cached_property
+    def map(self) -> ReferenceMap:
+        store = open_features(self.store_folder)
+
+        def read(image_id: str, count: int | None) -> Features:
+            return store.read(f"{self.reference.epoch}/{image_id}", count)
+
+        return ReferenceMap(self.reference, read, self.noise)
+
+    @cached_property
+    def matcher(self) -> Matcher:
+        return load_component(MATCHERS, self.config.matching.matcher, **self.config.matching.options)
+
+    def __call__(self, image: Image) -> Outcome:
+        failure = self.failed.get(feature_id(image))
+        if failure is not None:
+            return Rejected(image.image_id, RejectReason(failure[0]), failure[1])
+        try:
+            features = open_features(self.store_folder).read(feature_id(image))
+            return localize_image(
+                image,
+                features,
+                self.map,
+                self.matcher,
+                self.config.candidates,
+                self.config.localize,
+                self.config.matching.max_keypoints,
+            )
+        except (ArithmeticError, ValueError, IndexError, np.linalg.LinAlgError) as error:
+            logger.exception("localization of %s failed", image.image_id)
+            return Rejected(image.image_id, RejectReason.INTERNAL, f"{type(error).__name__}: {error}")
+
+
+def run(context: StageContext) -> StageSummary:
+    """Localises every image that has no outcome yet, storing each outcome as it comes."""
+    folder = context.folder / ITEMS
+    done = item_ids(folder)
+    images = context.survey.epoch.images
+    pending = [image for image in images if image.image_id not in done]
+    task = make_task(context)
+    for outcome in context.executor.map_items(task, pending, "localize"):
+        write_outcome(item_path(folder, outcome.image_id), outcome)
+    outcomes = read_outcomes(context.folder, context.survey.epoch)
+    return _summary(outcomes, len(pending))
+
+
+def make_task(context: StageContext) -> LocalizeTask:
+    noise, suspects = read_noise(context.before["network"])
+    failed = _failed(context.before["features"])
+    reference = context.survey.reference
+    usable = tuple(i for i in reference.images if i.image_id not in suspects and feature_id(i) not in failed)
+    if len(usable) < 2:
+        raise StageError(f"Only {len(usable)} reference images can be used, at least two are needed.")
+    return LocalizeTask(Campaign(reference.epoch, usable), noise, context.before["store"], context.config, failed)
+
+
+def read_outcomes(folder: Path, epoch: Campaign) -> list[Outcome]:
+    """The outcomes of all images of an epoch, in its order."""
+    return [read_outcome(item_path(folder / ITEMS, image.image_id)) for image in epoch.images]
+
+
+def _failed(features_folder: Path) -> dict[str, tuple[str, str]]:
+    data = json.loads((features_folder / "stage.json").read_text(encoding="utf-8"))
+    return {key: (reason, detail) for key, (reason, detail) in data["data"]["failed"].items()}
+
+
+def _summary(outcomes: list[Outcome], computed: int) -> StageSummary:
+    localized = [o for o in outcomes if isinstance(o, Localized)]
+    rejected = Counter(o.reason.value for o in outcomes if isinstance(o, Rejected))
+    line = f"{len(localized)} of {len(outcomes)} images localized"
+    if localized:
+        sigmas = [float(np.sqrt(np.trace(o.world_from_cam_cov[3:, 3:]))) for o in localized]
+        counts = [o.correspondence_count for o in localized]
+        line += f", median sigma {1e3 * np.median(sigmas):.1f} mm, {np.median(counts):.0f} correspondences"
+    if rejected:
+        line += "; rejected: " + ", ".join(f"{count} {reason}" for reason, count in rejected.items())
+    return StageSummary(line, {"localized": len(localized), "rejected": dict(rejected)}, computed, len(outcomes))
+
+
+def components(config: Config, stage: str) -> str:
+    """What else than configuration and inputs decides the result: the matcher's version, for this stage alone."""
+    if stage != "localize":
+        return ""
+    return load_component(MATCHERS, config.matching.matcher, **config.matching.options).version()

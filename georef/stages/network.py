@@ -1,0 +1,111 @@
+"""Stage `network`: the uncertainty of the reference and of its keypoints, from the reference alone."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+
+from georef.estimation.guided import GuidedOptions, PosedFeatures
+from georef.estimation.reference_network import (
+    START_KEYPOINT,
+    NetworkResult,
+    choose_images,
+    estimate_noise,
+    match_network,
+)
+from georef.geometry.rigid import Rigid3
+from georef.io.files import write_text_atomically
+from georef.project import ReferenceSigma
+from georef.stages.base import StageContext, StageSummary, feature_id, open_features
+from georef.types.campaign import Image
+from georef.types.results import ReferenceNoise
+
+RESULT = "reference.json"
+COMMON = (
+    "What is common to all reference images (a shift, a rotation, a scale of the whole) leaves no residual among them "
+    "and is not observable here; it is not part of any sigma in this report."
+)
+
+
+def run(context: StageContext) -> StageSummary:
+    """Matches a sample of reference images under their known geometry and estimates variance components."""
+    config = context.config
+    images = _usable_reference(context)
+    chosen = [images[i] for i in choose_images(_positions(images), config.network.max_images)]
+    store = open_features(context.before["store"])
+    posed = [
+        PosedFeatures.of(store.read(feature_id(image), config.network.max_keypoints), image.camera, _pose(image))
+        for image in chosen
+    ]
+    options = GuidedOptions(
+        config.localize.guided_gate, config.localize.guided_min_similarity, config.localize.guided_ratio
+    )
+    matches = match_network(posed, config.network.neighbours, options, context.executor.progress)
+    result = estimate_noise(posed, matches, config.network, config.adjust, _declared(context))
+    suspects = [chosen[i].image_id for i in result.suspects]
+    data = _as_data(result, suspects)
+    write_text_atomically(json.dumps(data, indent=1), context.folder / RESULT)
+    noise = result.noise
+    line = (
+        f"reference sigma {noise.source}: position {1e3 * noise.position_sigma_m[0]:.1f} mm, rotation "
+        f"{np.degrees(noise.rotation_sigma_rad[0]):.4f} deg, from {result.points} points in {result.images} images"
+    )
+    if suspects:
+        line += f"; set aside, in contradiction to the others: {', '.join(suspects)}"
+    return StageSummary(line, data, len(chosen), len(chosen))
+
+
+def read_noise(folder: Path) -> tuple[ReferenceNoise, tuple[str, ...]]:
+    """The result of this stage: the noise, and the reference images to leave aside."""
+    data = json.loads((folder / RESULT).read_text(encoding="utf-8"))
+    noise = ReferenceNoise(
+        keypoint_sigma=data["keypoint_sigma"],
+        position_sigma_m=tuple(data["position_sigma_m"]),
+        rotation_sigma_rad=tuple(data["rotation_sigma_rad"]),
+        source=data["source"],
+    )
+    return noise, tuple(data["suspects"])
+
+
+def _usable_reference(context: StageContext) -> list[Image]:
+    failed = context.before["features"] / "stage.json"
+    skipped = json.loads(failed.read_text(encoding="utf-8"))["data"]["failed"]
+    return [image for image in context.survey.reference.images if feature_id(image) not in skipped]
+
+
+def _pose(image: Image) -> Rigid3:
+    assert image.world_from_cam is not None
+    return image.world_from_cam
+
+
+def _positions(images: list[Image]) -> np.ndarray:
+    return np.array([_pose(image).translation for image in images])
+
+
+def _declared(context: StageContext) -> ReferenceNoise | None:
+    sigma = context.project.file.reference.sigma
+    if not isinstance(sigma, ReferenceSigma):
+        return None
+    x, y, z = np.radians(sigma.rotation_deg)
+    return ReferenceNoise(START_KEYPOINT, sigma.position_m, (float(x), float(y), float(z)), "declared")
+
+
+def _as_data(result: NetworkResult, suspects: list[str]) -> dict:
+    noise = result.noise
+    return {
+        "source": noise.source,
+        "keypoint_sigma": noise.keypoint_sigma,
+        "position_sigma_m": list(noise.position_sigma_m),
+        "rotation_sigma_rad": list(noise.rotation_sigma_rad),
+        "suspects": suspects,
+        "images": result.images,
+        "points": result.points,
+        "observations": result.observations,
+        "components": {
+            name: {"factor": c.factor, "redundancy": c.redundancy, "observations": c.observations}
+            for name, c in result.components.items()
+        },
+        "not_observable": COMMON,
+    }

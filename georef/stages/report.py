@@ -1,0 +1,190 @@
+"""Stage `report`: poses in the project's CRS, report.json with its HTML, and the recording."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from georef import __version__
+from georef.evaluation.check_points import evaluate_check_points
+from georef.evaluation.forward_intersection import PosedImages
+from georef.geometry.rigid import Array, Rigid3
+from georef.io.files import write_text_atomically
+from georef.io.pose_records import PoseRecord, PosesFrame
+from georef.io.poses import write_poses
+from georef.report.build import ReportInput, build_report
+from georef.report.html import render_html
+from georef.stages.adjust import AdjustedEpoch, read_adjusted
+from georef.stages.base import StageContext, StageSummary
+from georef.stages.localize import read_outcomes
+from georef.stages.network import RESULT as NETWORK_RESULT
+from georef.stages.survey import Survey
+from georef.types.results import Localized, Outcome, Rejected
+
+POSES, LOCALIZATION, REPORT, HTML, RECORDING = (
+    "poses.csv",
+    "localization.csv",
+    "report.json",
+    "report.html",
+    "recording.rrd",
+)
+
+
+def run(context: StageContext) -> StageSummary:
+    """Publishes the epoch: poses before and after the adjustment, the report, the recording."""
+    survey, folder = context.survey, context.project.published(context.epoch)
+    outcomes = read_outcomes(context.before["localize"], survey.epoch)
+    adjusted = read_adjusted(context.before["adjust"])
+    frame = poses_frame(survey)
+    write_poses(_localized_records(outcomes, survey), folder / LOCALIZATION, frame)
+    write_poses(_adjusted_records(outcomes, adjusted, survey), folder / POSES, frame)
+    report = build_report(_report_input(context, outcomes, adjusted))
+    write_text_atomically(json.dumps(report, indent=1, allow_nan=False), folder / REPORT)
+    write_text_atomically(render_html(report), folder / HTML)
+    if context.config.report.recording:
+        from georef.viewer.recording import write_recording
+
+        write_recording(context, outcomes, adjusted, report, folder / RECORDING)
+    return StageSummary(_line(report), _headline(report), 1, 1)
+
+
+def outputs_exist(context: StageContext, stage: str) -> bool:
+    """Whether what the report stage publishes is there, of this very run (others may have been published since)."""
+    if stage != "report":
+        return True
+    path = context.project.published(context.epoch) / REPORT
+    try:
+        stored = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return False
+    return stored.get("fingerprint") == context.folder.name
+
+
+def poses_frame(survey: Survey) -> PosesFrame:
+    world = survey.world.describe()
+    origin = ", ".join(f"{value:.3f}" for value in survey.world.origin_in_crs)
+    definition = survey.world.definition
+    return PosesFrame(world["kind"], definition.horizontal, definition.height, f"{origin} of this CRS")
+
+
+def _records(
+    ids: Sequence[str], poses: Sequence[Rigid3], covs: Sequence[Array], survey: Survey
+) -> dict[str, PoseRecord]:
+    """Poses in the world as records in the CRS."""
+    if not ids:
+        return {}
+    positions = survey.world.crs_from_world(np.array([pose.translation for pose in poses]))
+    turns = survey.world.crs_axes_from_world(positions)
+    return {
+        name: PoseRecord(
+            image_id=name,
+            status="localized",
+            position_in_crs=position,
+            axes_from_cam=turn @ pose.rotation,
+            cov=cov,
+        )
+        for name, pose, cov, position, turn in zip(ids, poses, covs, positions, turns, strict=True)
+    }
+
+
+def _localized_records(outcomes: Sequence[Outcome], survey: Survey) -> list[PoseRecord]:
+    localized = [o for o in outcomes if isinstance(o, Localized)]
+    records = _records(
+        [o.image_id for o in localized],
+        [o.world_from_cam for o in localized],
+        [o.world_from_cam_cov for o in localized],
+        survey,
+    )
+    return [records.get(o.image_id) or _rejected(o) for o in outcomes]
+
+
+def _adjusted_records(outcomes: Sequence[Outcome], adjusted: AdjustedEpoch, survey: Survey) -> list[PoseRecord]:
+    covs = [adjusted.cov(i) for i in range(len(adjusted.image_ids))]
+    records = _records(adjusted.image_ids, adjusted.world_from_cams, covs, survey)
+    return [records.get(o.image_id) or _rejected(o) for o in outcomes]
+
+
+def _rejected(outcome: Outcome) -> PoseRecord:
+    assert isinstance(outcome, Rejected)
+    return PoseRecord(outcome.image_id, f"rejected: {outcome.reason.value}")
+
+
+def _report_input(context: StageContext, outcomes: Sequence[Outcome], adjusted: AdjustedEpoch) -> ReportInput:
+    survey = context.survey
+    network = json.loads((context.before["network"] / NETWORK_RESULT).read_text(encoding="utf-8"))
+    return ReportInput(
+        project=context.project.file.name,
+        epoch=context.epoch,
+        version=__version__,
+        fingerprint=context.folder.name,
+        config=context.config.model_dump(),
+        world=survey.world.describe(),
+        outcomes=tuple(outcomes),
+        adjustment=adjusted.data,
+        network=network,
+        check_before=evaluate_check_points(survey.check, _posed_after_pnp(outcomes, survey)),
+        check_after=evaluate_check_points(survey.check, _posed_adjusted(adjusted, survey)),
+        axes_from_world=_axes_at_points(survey),
+        surveyed_control=context.config.adjust.surveyed_control,
+        control_ids=tuple(point.point_id for point in survey.control),
+        timings=_timings(context),
+    )
+
+
+def _posed_after_pnp(outcomes: Sequence[Outcome], survey: Survey) -> PosedImages:
+    """Single-image poses; what they share through the reference is not known here, so their errors count as independent."""
+    localized = [o for o in outcomes if isinstance(o, Localized)]
+
+    def joint(indices: list[int]) -> Array:
+        cov = np.zeros((6 * len(indices), 6 * len(indices)))
+        for k, index in enumerate(indices):
+            cov[6 * k : 6 * k + 6, 6 * k : 6 * k + 6] = localized[index].world_from_cam_cov
+        return cov
+
+    ids = tuple(o.image_id for o in localized)
+    cameras = tuple(survey.epoch[name].camera for name in ids)
+    return PosedImages(ids, cameras, tuple(o.world_from_cam for o in localized), joint)
+
+
+def _posed_adjusted(adjusted: AdjustedEpoch, survey: Survey) -> PosedImages:
+    cameras = tuple(survey.epoch[name].camera for name in adjusted.image_ids)
+    return PosedImages(adjusted.image_ids, cameras, adjusted.world_from_cams, adjusted.joint)
+
+
+def _axes_at_points(survey: Survey) -> dict[str, Array]:
+    """The turn from world axes to those of the CRS at each check and control point."""
+    points = [*survey.check, *survey.control]
+    if not points:
+        return {}
+    positions = survey.world.crs_from_world(np.array([p.point_in_world for p in points]))
+    turns = survey.world.crs_axes_from_world(positions)
+    return {point.point_id: turn for point, turn in zip(points, turns, strict=True)}
+
+
+def _timings(context: StageContext) -> dict[str, Any]:
+    """What each stage before this one cost when it was computed."""
+    out = {}
+    for name, folder in context.before.items():
+        path = Path(folder) / "stage.json"
+        if path.is_file():
+            record = json.loads(path.read_text(encoding="utf-8"))
+            out[name] = {**record["timing"], "computed": record["computed"], "total": record["total"]}
+    return out
+
+
+def _headline(report: dict[str, Any]) -> dict[str, Any]:
+    return {"images": report["images"], "check_points": report["check_points"]}
+
+
+def _line(report: dict[str, Any]) -> str:
+    check = report["check_points"]
+    if not check["count"]:
+        return "no check points"
+    return (
+        f"{check['count']} {check['kind']} check points: RMSE E {1e3 * check['rmse_e_m']:.1f}, "
+        f"N {1e3 * check['rmse_n_m']:.1f}, H {1e3 * check['rmse_h_m']:.1f}, 3D {1e3 * check['rmse_3d_m']:.1f} mm"
+    )

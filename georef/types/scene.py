@@ -1,0 +1,44 @@
+"""Image observations of points, and scenes of posed images with the points they see."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from georef.geometry.rigid import Array
+
+
+@dataclass(frozen=True, eq=False)
+class Observations:
+    """Image observations of points, in any order: row i is one point seen in one view.
+
+    Pixels are ideal (distortion removed) full-resolution pixels.
+    """
+
+    point: NDArray[np.int64]  # (n,) index of the point
+    view: NDArray[np.int64]  # (n,) index of the view (image)
+    pixel: Array  # (n, 2)
+    sigma_px: Array  # (n,) 1-sigma of each coordinate
+    keypoint: NDArray[np.int64]  # (n,) index of the keypoint in its image, -1 for a mark
+
+    def __len__(self) -> int:
+        return len(self.point)
+
+    def take(self, selection: NDArray[np.bool_] | NDArray[np.integer]) -> Observations:
+        return Observations(
+            self.point[selection],
+            self.view[selection],
+            self.pixel[selection],
+            self.sigma_px[selection],
+            self.keypoint[selection],
+        )
+
+    def with_points(self, point: NDArray[np.int64]) -> Observations:
+        """The same observations of renumbered points."""
+        return Observations(point, self.view, self.pixel, self.sigma_px, self.keypoint)
+
+    def scaled(self, factor: float) -> Observations:
+        """The same observations with all sigmas multiplied by a factor."""
+        return Observations(self.point, self.view, self.pixel, self.sigma_px * factor, self.keypoint)
