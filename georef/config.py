@@ -8,7 +8,7 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
 
 from georef.errors import ConfigError
 
@@ -73,6 +73,16 @@ class AdjustConfig(Section):
     gate_probability: float = Field(0.999, gt=0.5, lt=1)
     max_iterations: int = Field(30, ge=1)
 
+    @field_validator("constraints", mode="before")
+    @classmethod
+    def _one_kind(cls, value: Any) -> Any:
+        if isinstance(value, (list, tuple, dict)) or (isinstance(value, str) and "," in value):
+            raise ValueError(
+                "choose one of 'auto-gcps', 'pose-priors', 'none'. Automatic GCPs and pose priors come from the same "
+                "matches: both together would count them twice, and the result would claim to be better than it is"
+            )
+        return value
+
 
 class ReportConfig(Section):
     recording: bool = True
@@ -108,12 +118,16 @@ def load_config(preset: str, layers: Iterable[Mapping[str, Any]] = ()) -> Config
     Raises ConfigError with the key, its value and the nearest valid key.
     """
     merged: dict[str, Any] = {}
-    for layer in (read_toml(presets_folder() / "default.toml"), _read_preset(preset), *layers):
+    for path in (presets_folder() / "default.toml", _preset_path(preset)):
+        layer = read_toml(path)
+        validated(Config, layer, str(path))  # by itself, so that the message names the file
         merged = merge(merged, layer)
-    return validated(Config, merged, "the configuration")
+    for layer in layers:
+        merged = merge(merged, layer)
+    return validated(Config, merged, "[config] of project.toml, or --set")
 
 
-def _read_preset(preset: str) -> Mapping[str, Any]:
+def _preset_path(preset: str) -> Path:
     path = Path(preset)
     if path.suffix != ".toml":
         path = presets_folder() / f"{preset}.toml"
@@ -123,7 +137,7 @@ def _read_preset(preset: str) -> Mapping[str, Any]:
                 f"There is no preset '{preset}'.{_nearest(preset, known)}\nExpected one of {', '.join(known)}, "
                 "or the path of a .toml file."
             )
-    return read_toml(path)
+    return path
 
 
 def read_toml(path: Path) -> dict[str, Any]:
@@ -181,7 +195,8 @@ def _explain(model: type[BaseModel], item: dict[str, Any]) -> str:
         return f"Unknown key '{key}'.{_nearest(str(path[-1]), valid)} Valid keys here: {', '.join(valid)}."
     if item["type"] == "missing":
         return f"The key '{key}' is missing."
-    return f"The key '{key}' has the value {item['input']!r}: {item['msg'][0].lower()}{item['msg'][1:]}."
+    message = item["msg"].removeprefix("Value error, ")
+    return f"The key '{key}' has the value {item['input']!r}: {message[0].lower()}{message[1:]}."
 
 
 def _keys_beside(model: type[BaseModel], path: list[Any]) -> list[str]:

@@ -66,8 +66,8 @@ def _check(project: Project, survey: Survey) -> dict[str, Any]:
 STAGES: tuple[Stage, ...] = (
     Stage("features", 1, ("features",), _all_images, (), features.run),
     Stage("network", 1, ("network", "localize", "adjust"), _reference_files, ("features",), network.run),
-    Stage("localize", 1, ("matching", "candidates", "localize"), _epoch_files, ("features", "network"), localize.run),
-    Stage("adjust", 1, ("adjust", "localize"), _control, ("features", "network", "localize"), adjust.run),
+    Stage("localize", 2, ("matching", "candidates", "localize"), _epoch_files, ("features", "network"), localize.run),
+    Stage("adjust", 2, ("adjust", "localize"), _control, ("features", "network", "localize"), adjust.run),
     Stage("report", 1, ("report",), _check, ("features", "network", "localize", "adjust"), report.run),
 )
 

@@ -216,6 +216,7 @@ def _outcome(work: _Work, estimate: EstimatedPose | None, model: LocalModel, cho
         image_id=image_id,
         world_from_cam=estimate.world_from_cam,
         world_from_cam_cov=estimate.cov,
+        relative_cov=estimate.relative_cov,
         correspondence_count=inliers,
         sigma0=estimate.sigma0,
         matches=_reference_matches(used, [work.reference.images[i].image_id for i in chosen]),

@@ -39,6 +39,7 @@ class QueryImage:
 class EstimatedPose:
     world_from_cam: Rigid3
     cov: Array  # (6, 6) right perturbation
+    relative_cov: Array  # (6, 6) the same without the errors of the reference poses
     inliers: NDArray[np.bool_]  # (P,) of the local model's points
     sigma0: float  # a-posteriori over a-priori standard deviation of an observation
 
@@ -112,8 +113,9 @@ def with_covariance(
     cov_unit = np.linalg.inv(normal)
     squares = float(np.einsum("ni,nij,nj->", system.residual, system.weight, system.residual))
     variance_factor = squares / max(2 * len(used) - 6, 1)
-    cov = variance_factor * cov_unit + _shared_reference_part(system, cov_unit, used, reference_pose_cov)
-    return EstimatedPose(pose, symmetric(cov), inliers, float(np.sqrt(variance_factor)))
+    relative = symmetric(variance_factor * cov_unit)
+    cov = symmetric(relative + _shared_reference_part(system, cov_unit, used, reference_pose_cov))
+    return EstimatedPose(pose, cov, relative, inliers, float(np.sqrt(variance_factor)))
 
 
 @dataclass(frozen=True, eq=False)

@@ -167,9 +167,10 @@ def check_point_errors(
 ) -> CheckPointErrors:
     """Differences of check points that are intersected from posed images; sigma_factor scales their marks' sigmas.
 
-    predicted_cov adds the noise of the marks, the poses with their correlations between images, and the point's own
-    covariance. It takes the three for independent: a relative check point whose coordinates share errors with the
-    poses is judged too leniently. Raises ValueError where sigma_factor is not positive.
+    predicted_cov adds the noise of the marks, the poses with their correlations between images, and the covariance of
+    an absolute point, taken as independent. A relative point is part of the reference: give `images` the covariance of
+    the poses against the reference as it is published; the point's own sigma, which says how well the reference is
+    known, earns no credit. Raises ValueError where sigma_factor is not positive.
     """
     if not sigma_factor > 0:
         raise ValueError("sigma_factor must be positive")
@@ -195,7 +196,8 @@ def _joint_cov(pairs: list[tuple[CheckPoint, Intersection]], poses_cov: JointPos
     """Joint covariance (3P, 3P) of the differences: poses, marks, and the reference coordinates."""
     out = symmetric(points_cov_from_poses([found for _, found in pairs], poses_cov))
     for i, (point, found) in enumerate(pairs):
-        out[3 * i : 3 * i + 3, 3 * i : 3 * i + 3] += symmetric(factor**2 * found.mark_cov + point.cov)
+        own = point.cov if point.kind is CheckKind.ABSOLUTE else np.zeros((3, 3))
+        out[3 * i : 3 * i + 3, 3 * i : 3 * i + 3] += symmetric(factor**2 * found.mark_cov + own)
     return out
 
 

@@ -84,6 +84,7 @@ def summarize_differences(
     mean_square = square.mean(axis=0) if count else np.full(3, np.nan)
     e, n, h = np.sqrt(mean_square).tolist()
     axes = [rmse_interval(differences_m[:, axis : axis + 1]) for axis in range(3)]
+    dof = effective_dof(joint_cov, 3) if joint_cov is not None and count else None
     return CheckPointSummary(
         kind=kind,
         count=count,
@@ -98,7 +99,5 @@ def summarize_differences(
         rmse_3d_interval_m=rmse_interval(differences_m),
         mean_m=differences_m.mean(axis=0) if count else np.full(3, np.nan),
         std_m=differences_m.std(axis=0, ddof=1) if count > 1 else np.full(3, np.nan),
-        nees=summarize_nees(
-            nees_values, 3, effective_dof=effective_dof(joint_cov, 3) if joint_cov is not None and count else None
-        ),
+        nees=summarize_nees(nees_values, 3, effective_dof=dof),
     )

@@ -103,7 +103,7 @@ def _distort(slopes: Array, distortion: tuple[float, ...]) -> Array:
 
 
 def _newton_step(slopes: Array, error: Array, distortion: tuple[float, ...]) -> Array:
-    """Change of slopes (N, 2) that removes an error (N, 2) of the distorted slopes; bounded, so that it stays finite."""
+    """Change of slopes (N, 2) that removes an error (N, 2) of the distorted slopes; bounded, so as to stay finite."""
     k1, k2, p1, p2 = distortion
     x, y = slopes[..., 0], slopes[..., 1]
     r2 = x * x + y * y

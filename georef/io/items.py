@@ -77,6 +77,7 @@ def write_outcome(path: Path, outcome: Outcome) -> None:
     arrays = {
         "world_from_cam": outcome.world_from_cam.matrix(),
         "cov": outcome.world_from_cam_cov,
+        "relative_cov": outcome.relative_cov,
         "points": outcome.points_in_world,
         "keypoints": outcome.keypoints,
     }
@@ -94,6 +95,7 @@ def read_outcome(path: Path) -> Outcome:
         image_id=header["image_id"],
         world_from_cam=Rigid3.from_matrix(arrays["world_from_cam"]),
         world_from_cam_cov=arrays["cov"],
+        relative_cov=arrays["relative_cov"],
         correspondence_count=header["correspondence_count"],
         sigma0=header["sigma0"],
         matches=tuple(matches),

@@ -7,9 +7,11 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from scipy.linalg import block_diag
 
-from georef.evaluation.check_points import CheckPointError, CheckPointErrors, CheckPointReport, CheckPointSummary
+from georef.evaluation.check_points import CheckPointError, CheckPointErrors, CheckPointReport
 from georef.geometry.rigid import Array
+from georef.report.plan import Placed, plan_section
 from georef.types.constraints import CheckKind
 from georef.types.results import Localized, Outcome, Rejected
 
@@ -30,9 +32,10 @@ class ReportInput:
     outcomes: tuple[Outcome, ...]
     adjustment: dict[str, Any]
     network: dict[str, Any]
-    check_before: CheckPointReport  # with the poses straight after PnP
-    check_after: CheckPointReport
+    check_before: Mapping[CheckKind, CheckPointReport]  # with the poses straight after PnP
+    check_after: Mapping[CheckKind, CheckPointReport]
     axes_from_world: Mapping[str, Array]  # by point id: (3, 3) world axes to CRS axes
+    placed: Placed
     surveyed_control: bool
     control_ids: tuple[str, ...]
     timings: dict[str, Any]
@@ -53,7 +56,7 @@ def build_report(given: ReportInput) -> dict[str, Any]:
             "total": len(given.outcomes),
             "localized": len(localized),
             "rejected": len(given.outcomes) - len(localized),
-            "by_image": [_image(o, given.adjustment) for o in given.outcomes],
+            "by_image": _images(given),
         },
         "reference": given.network,
         "constraints": {
@@ -71,64 +74,101 @@ def build_report(given: ReportInput) -> dict[str, Any]:
         "gates": given.adjustment.get("gates", {}),
         "variance_components": given.adjustment.get("variance_components", {}),
         "adjustment": {key: given.adjustment.get(key) for key in ("iterations", "converged", "image_sigma_scale")},
+        "plan": _plan(given),
         "timings": given.timings,
         "config": given.config,
     }
 
 
-def _image(outcome: Outcome, adjustment: dict[str, Any]) -> dict[str, Any]:
-    if isinstance(outcome, Rejected):
-        return {
-            "image": outcome.image_id,
-            "status": "rejected",
-            "reason": outcome.reason.value,
-            "detail": outcome.detail,
-            "notes": list(outcome.notes),
-        }
-    position_cov = (
-        outcome.world_from_cam.rotation @ outcome.world_from_cam_cov[3:, 3:] @ outcome.world_from_cam.rotation.T
-    )
+def _images(given: ReportInput) -> list[dict[str, Any]]:
+    turns = given.placed.axes_at({o.image_id: o.world_from_cam for o in given.outcomes if isinstance(o, Localized)})
+    return [
+        _localized(o, turns[o.image_id], given) if isinstance(o, Localized) else _rejected(o) for o in given.outcomes
+    ]
+
+
+def _rejected(outcome: Rejected) -> dict[str, Any]:
+    return {
+        "image": outcome.image_id,
+        "status": "rejected",
+        "reason": outcome.reason.value,
+        "detail": outcome.detail,
+        "notes": list(outcome.notes),
+    }
+
+
+def _localized(outcome: Localized, turn: Array, given: ReportInput) -> dict[str, Any]:
+    """Sigmas and residuals are along the axes of the CRS, to which `turn` leads."""
     return {
         "image": outcome.image_id,
         "status": "localized",
         "correspondences": outcome.correspondence_count,
         "references": len(outcome.matches),
         "sigma0": outcome.sigma0,
-        "pnp_sigma_m": np.sqrt(np.diag(position_cov)).tolist(),
+        "pnp_sigma_m": _sigma(outcome.world_from_cam_cov[3:, 3:], turn @ outcome.world_from_cam.rotation),
         "gnss_rejected": outcome.gnss_rejected,
         "gnss_offset_m": outcome.gnss_offset_m,
         "notes": list(outcome.notes),
         "cpu_s": outcome.cpu_s,
-        "adjustment": adjustment.get("images_used", {}).get(outcome.image_id),
+        "adjustment": _adjusted(outcome.image_id, turn, given),
     }
 
 
-def _check_section(report: CheckPointReport, given: ReportInput) -> dict[str, Any]:
+def _adjusted(name: str, turn: Array, given: ReportInput) -> dict[str, Any] | None:
+    used = given.adjustment.get("images_used", {}).get(name)
+    if used is None:
+        return None
+    out = {**used, "sigma_m": _sigma(given.placed.position_covs[name], turn)}
+    if "gnss_residual_m" in used:
+        out["gnss_residual_m"] = (turn @ used["gnss_residual_m"]).tolist()
+        out["gnss_sigma_m"] = _sigma(given.placed.gnss_covs[name], turn)
+    return out
+
+
+def _sigma(cov: Array, turn: Array) -> list[float]:
+    """1-sigma (3,) of a covariance, along the axes that `turn` leads to."""
+    return np.sqrt(np.diag(turn @ cov @ turn.T)).tolist()
+
+
+def _plan(given: ReportInput) -> dict[str, Any]:
+    reports = given.check_after.values() if isinstance(given.check_after, Mapping) else [given.check_after]
+    check = {e.point_id: e.difference_m for report in reports for e in report.errors.determined}
+    control = {c["point"]: np.array(c["residual_m"]) for c in given.adjustment.get("control", [])}
+    return plan_section(given.placed, check, control)
+
+
+def _check_section(reports: Mapping[CheckKind, CheckPointReport], given: ReportInput) -> dict[str, Any]:
     """Each kind apart; the first levels repeat the absolute kind if there is one, else the relative."""
-    errors = _in_crs_axes(report.errors, given.axes_from_world)
-    summaries = errors.summarize()
-    if not summaries:
+    if not reports:
         return {**_NO_CHECK, "by_kind": {}, "points": [], "not_determined": []}
-    main = next(kind for kind in (CheckKind.ABSOLUTE, CheckKind.RELATIVE) if kind in summaries)
-    estimated = report.summaries_estimated or {}
+    by_kind, points, not_determined = {}, [], []
+    for kind, report in reports.items():
+        errors = _in_crs_axes(report.errors, given.axes_from_world)
+        estimated = (report.summaries_estimated or {}).get(kind)
+        by_kind[kind.value] = {
+            **errors.summarize()[kind].to_dict(),
+            "mark_sigma": report.component.to_dict(),
+            "nees_with_estimated_mark_sigma": None if estimated is None else estimated.nees.to_dict(),
+        }
+        points += [error.to_dict() for error in errors.determined]
+        not_determined += [entry.to_dict() for entry in errors.not_determined]
+    main = next(kind for kind in (CheckKind.ABSOLUTE, CheckKind.RELATIVE) if kind in reports)
     return {
-        **summaries[main].to_dict(),
-        "by_kind": {kind.value: _with_nees(summary, estimated.get(kind)) for kind, summary in summaries.items()},
-        "points": [error.to_dict() for error in errors.determined],
-        "not_determined": [entry.to_dict() for entry in errors.not_determined],
-        "mark_sigma": report.component.to_dict(),
-        "nees_with_estimated_mark_sigma": estimated[main].nees.to_dict() if main in estimated else None,
+        **by_kind[main.value],
+        "by_kind": by_kind,
+        "points": points,
+        "not_determined": not_determined,
         "residual": "estimated minus reference, along the axes of the CRS",
     }
 
 
-def _with_nees(summary: CheckPointSummary, estimated: CheckPointSummary | None) -> dict[str, Any]:
-    nees = None if estimated is None else estimated.nees.to_dict()
-    return {**summary.to_dict(), "nees_with_estimated_mark_sigma": nees}
-
-
 def _in_crs_axes(errors: CheckPointErrors, axes: Mapping[str, Array]) -> CheckPointErrors:
-    return replace(errors, determined=tuple(_turned(error, axes[error.point_id]) for error in errors.determined))
+    determined = tuple(_turned(error, axes[error.point_id]) for error in errors.determined)
+    joint = errors.joint_cov
+    if joint is not None and determined:
+        turns = block_diag(*(axes[error.point_id] for error in determined))
+        joint = turns @ joint @ turns.T
+    return replace(errors, determined=determined, joint_cov=joint)
 
 
 def _turned(error: CheckPointError, turn: Array) -> CheckPointError:

@@ -30,6 +30,7 @@ class AdjustedEpoch:
     image_ids: tuple[str, ...]
     world_from_cams: tuple[Rigid3, ...]
     joint_cov: Array  # (6M, 6M)
+    relative_joint_cov: Array  # (6M, 6M) against the reference as it is published: without its own errors
     points: Array  # (P, 3) automatic GCPs and tie points
     colors_rgb: Array  # (P, 3)
     data: dict[str, Any]
@@ -39,8 +40,11 @@ class AdjustedEpoch:
 
     def joint(self, indices: list[int]) -> Array:
         """Joint covariance (6k, 6k) of some images."""
-        rows = np.concatenate([np.arange(6 * i, 6 * i + 6) for i in indices])
-        return self.joint_cov[np.ix_(rows, rows)]
+        return _blocks(self.joint_cov, indices)
+
+    def relative_joint(self, indices: list[int]) -> Array:
+        """The same without the errors of the reference."""
+        return _blocks(self.relative_joint_cov, indices)
 
 
 def run(context: StageContext) -> StageSummary:
@@ -48,7 +52,7 @@ def run(context: StageContext) -> StageSummary:
     epoch, config = context.survey.epoch, context.config
     localized = [o for o in read_outcomes(context.before["localize"], epoch) if isinstance(o, Localized)]
     if not localized:
-        write_item(context.folder / RESULT, {"image_ids": [], "data": {}}, _arrays((), np.zeros((0, 0)), None, None))
+        write_item(context.folder / RESULT, {"image_ids": [], "data": {}}, _arrays(None, np.zeros((0, 3), np.uint8)))
         return StageSummary("no image was localized; nothing to adjust")
     store = open_features(context.before["store"])
     images = [epoch[o.image_id] for o in localized]
@@ -65,8 +69,7 @@ def run(context: StageContext) -> StageSummary:
     problem = epoch_problem(images, localized, posed, ties, reference, context.survey.control, config.adjust)
     adjusted = adjust(problem, config.adjust)
     data = _data(problem, adjusted)
-    colors = _colors(adjusted.problem, posed)
-    arrays = _arrays(adjusted.solution.world_from_cams, adjusted.posterior.poses, adjusted.solution.points, colors)
+    arrays = _arrays(adjusted, _colors(adjusted.problem, posed))
     write_item(context.folder / RESULT, {"image_ids": list(adjusted.problem.image_ids), "data": data}, arrays)
     return StageSummary(_line(data), data, len(localized), len(localized))
 
@@ -78,18 +81,27 @@ def read_adjusted(folder: Path) -> AdjustedEpoch:
         image_ids=tuple(header["image_ids"]),
         world_from_cams=tuple(Rigid3.from_matrix(m) for m in arrays["poses"]),
         joint_cov=arrays["joint_cov"],
+        relative_joint_cov=arrays["relative_joint_cov"],
         points=arrays["points"],
         colors_rgb=arrays["colors"],
         data=header["data"],
     )
 
 
-def _arrays(poses: tuple[Rigid3, ...], cov: Array, points: Array | None, colors: Array | None) -> dict[str, Array]:
+def _blocks(joint: Array, indices: list[int]) -> Array:
+    rows = np.concatenate([np.arange(6 * i, 6 * i + 6) for i in indices])
+    return joint[np.ix_(rows, rows)]
+
+
+def _arrays(adjusted: Adjusted | None, colors: Array) -> dict[str, Array]:
+    none = np.zeros((0, 0))
+    poses = () if adjusted is None else adjusted.solution.world_from_cams
     return {
         "poses": np.array([pose.matrix() for pose in poses]).reshape(-1, 4, 4),
-        "joint_cov": cov,
-        "points": np.zeros((0, 3)) if points is None else points,
-        "colors": np.zeros((0, 3), np.uint8) if colors is None else colors,
+        "joint_cov": none if adjusted is None else adjusted.posterior.poses,
+        "relative_joint_cov": none if adjusted is None else adjusted.cofactors.poses,
+        "points": np.zeros((0, 3)) if adjusted is None else adjusted.solution.points,
+        "colors": colors,
     }
 
 

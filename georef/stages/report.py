@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.linalg import block_diag
 
 from georef import __version__
-from georef.evaluation.check_points import evaluate_check_points
+from georef.evaluation.check_points import CheckPointReport, evaluate_check_points
 from georef.evaluation.forward_intersection import PosedImages
 from georef.geometry.rigid import Array, Rigid3
 from georef.io.files import write_text_atomically
@@ -18,11 +19,13 @@ from georef.io.pose_records import PoseRecord, PosesFrame
 from georef.io.poses import write_poses
 from georef.report.build import ReportInput, build_report
 from georef.report.html import render_html
+from georef.report.plan import Placed
 from georef.stages.adjust import AdjustedEpoch, read_adjusted
 from georef.stages.base import StageContext, StageSummary
 from georef.stages.localize import read_outcomes
 from georef.stages.network import RESULT as NETWORK_RESULT
 from georef.stages.survey import Survey
+from georef.types.constraints import CheckKind
 from georef.types.results import Localized, Outcome, Rejected
 
 POSES, LOCALIZATION, REPORT, HTML, RECORDING = (
@@ -126,33 +129,37 @@ def _report_input(context: StageContext, outcomes: Sequence[Outcome], adjusted: 
         outcomes=tuple(outcomes),
         adjustment=adjusted.data,
         network=network,
-        check_before=evaluate_check_points(survey.check, _posed_after_pnp(outcomes, survey)),
-        check_after=evaluate_check_points(survey.check, _posed_adjusted(adjusted, survey)),
+        check_before=_by_kind(survey, lambda kind: _posed_after_pnp(outcomes, survey, kind)),
+        check_after=_by_kind(survey, lambda kind: _posed_adjusted(adjusted, survey, kind)),
         axes_from_world=_axes_at_points(survey),
+        placed=_placed(adjusted, survey),
         surveyed_control=context.config.adjust.surveyed_control,
         control_ids=tuple(point.point_id for point in survey.control),
         timings=_timings(context),
     )
 
 
-def _posed_after_pnp(outcomes: Sequence[Outcome], survey: Survey) -> PosedImages:
-    """Single-image poses; what they share through the reference is not known here, so their errors count as independent."""
+def _by_kind(survey: Survey, posed: Callable[[CheckKind], PosedImages]) -> dict[CheckKind, CheckPointReport]:
+    """Absolute points against poses with the errors of the reference, relative ones against the reference as it is."""
+    kinds = [kind for kind in CheckKind if any(point.kind is kind for point in survey.check)]
+    return {kind: evaluate_check_points([p for p in survey.check if p.kind is kind], posed(kind)) for kind in kinds}
+
+
+def _posed_after_pnp(outcomes: Sequence[Outcome], survey: Survey, kind: CheckKind) -> PosedImages:
+    """Single-image poses; what they share through the reference is not known: their errors count as independent."""
     localized = [o for o in outcomes if isinstance(o, Localized)]
-
-    def joint(indices: list[int]) -> Array:
-        cov = np.zeros((6 * len(indices), 6 * len(indices)))
-        for k, index in enumerate(indices):
-            cov[6 * k : 6 * k + 6, 6 * k : 6 * k + 6] = localized[index].world_from_cam_cov
-        return cov
-
+    absolute = kind is CheckKind.ABSOLUTE
+    covs = [o.world_from_cam_cov if absolute else o.relative_cov for o in localized]
     ids = tuple(o.image_id for o in localized)
     cameras = tuple(survey.epoch[name].camera for name in ids)
-    return PosedImages(ids, cameras, tuple(o.world_from_cam for o in localized), joint)
+    poses = tuple(o.world_from_cam for o in localized)
+    return PosedImages(ids, cameras, poses, lambda indices: block_diag(*(covs[i] for i in indices)))
 
 
-def _posed_adjusted(adjusted: AdjustedEpoch, survey: Survey) -> PosedImages:
+def _posed_adjusted(adjusted: AdjustedEpoch, survey: Survey, kind: CheckKind) -> PosedImages:
     cameras = tuple(survey.epoch[name].camera for name in adjusted.image_ids)
-    return PosedImages(adjusted.image_ids, cameras, adjusted.world_from_cams, adjusted.joint)
+    joint = adjusted.joint if kind is CheckKind.ABSOLUTE else adjusted.relative_joint
+    return PosedImages(adjusted.image_ids, cameras, adjusted.world_from_cams, joint)
 
 
 def _axes_at_points(survey: Survey) -> dict[str, Array]:
@@ -165,6 +172,20 @@ def _axes_at_points(survey: Survey) -> dict[str, Array]:
     return {point.point_id: turn for point, turn in zip(points, turns, strict=True)}
 
 
+def _placed(adjusted: AdjustedEpoch, survey: Survey) -> Placed:
+    poses = list(zip(adjusted.image_ids, adjusted.world_from_cams, strict=True))
+    turned = {name: p.rotation @ adjusted.cov(i)[3:, 3:] @ p.rotation.T for i, (name, p) in enumerate(poses)}
+    return Placed(
+        world=survey.world,
+        new=dict(poses),
+        position_covs=turned,
+        gnss_covs={image.image_id: image.gnss.cov for image in survey.epoch.images if image.gnss is not None},
+        reference={i.image_id: i.world_from_cam for i in survey.reference.images if i.world_from_cam is not None},
+        check=survey.check,
+        control=survey.control,
+    )
+
+
 def _timings(context: StageContext) -> dict[str, Any]:
     """What each stage before this one cost when it was computed."""
     out = {}
@@ -172,7 +193,12 @@ def _timings(context: StageContext) -> dict[str, Any]:
         path = Path(folder) / "stage.json"
         if path.is_file():
             record = json.loads(path.read_text(encoding="utf-8"))
-            out[name] = {**record["timing"], "computed": record["computed"], "total": record["total"]}
+            out[name] = {
+                **record["timing"],
+                "computed": record["computed"],
+                "total": record["total"],
+                "finished": record["finished"],
+            }
     return out
 
 

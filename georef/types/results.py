@@ -41,7 +41,8 @@ class Localized:
 
     image_id: str
     world_from_cam: Rigid3
-    world_from_cam_cov: Array  # (6, 6), right perturbation, (rad, m), relative to the reference as a whole
+    world_from_cam_cov: Array  # (6, 6), right perturbation, (rad, m), against the reference as a whole
+    relative_cov: Array  # (6, 6), the same against the reference as it is published: without its own errors
     correspondence_count: int  # points used
     sigma0: float  # a-posteriori over a-priori standard deviation of an observation
     matches: tuple[ReferenceMatches, ...]

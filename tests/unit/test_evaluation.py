@@ -36,9 +36,6 @@ def random_cov(rng: np.random.Generator, sigma_rad: float, sigma_m: float) -> Ar
     return (mix @ mix.T) * np.outer(scale, scale)
 
 
-# --- poses ----------------------------------------------------------------------------------------
-
-
 def noisy_poses(sigmas: TruthSigmas | None = None) -> tuple[Estimates, dict[str, Rigid3]]:
     """400 estimates whose errors have the covariances that stand beside them, and a truth with its own errors."""
     rng = np.random.default_rng(11)
@@ -131,9 +128,6 @@ def test_nothing_expected_and_nothing_estimated() -> None:
         compare_poses({"a": (Rigid3(np.eye(3), np.full(3, np.nan)), None)}, {"a": Rigid3.identity()})
 
 
-# --- statistics -----------------------------------------------------------------------------------
-
-
 def test_median_interval_covers_the_median_of_any_distribution() -> None:
     rng = np.random.default_rng(3)
     samples = rng.exponential(size=(2000, 25))
@@ -156,9 +150,6 @@ def test_nees_is_the_squared_length_in_sigmas() -> None:
     with pytest.raises(ValueError, match="positive definite"):
         nees(np.ones(2), np.array([[1.0, 2.0], [2.0, 1.0]]))
     assert summarize_nees([None, 6.0], 6).count == 1
-
-
-# --- check points ---------------------------------------------------------------------------------
 
 
 def true_poses() -> list[Rigid3]:
@@ -240,9 +231,8 @@ def test_the_interval_of_the_mean_nees_knows_that_points_share_the_errors_of_the
         assert summary.effective_dof < 30.0
         inside += bool(summary.consistent)
         naive += bool(summarize_nees([(summary.mean_ratio or 0.0) * 36], 36).consistent)
-    print(inside, naive, summary)
     assert inside >= 35
-    assert naive < inside
+    assert naive < 30
 
 
 def test_absolute_and_relative_points_are_never_pooled() -> None:
@@ -277,8 +267,8 @@ def test_points_that_are_not_determined_are_reported() -> None:
     assert (summary.count, summary.not_determined) == (1, 3)
     assert result.determined[0].predicted_cov is None
     assert summary.nees.mean_ratio is None
-    only = check_point_errors([one], images(true_poses(), None))
-    json.dumps(only.summarize()[CheckKind.ABSOLUTE].to_dict(), allow_nan=False)
+    only = check_point_errors([one], images(true_poses(), None)).summarize()[CheckKind.ABSOLUTE]
+    json.dumps(only.to_dict(), allow_nan=False)
 
 
 @pytest.mark.parametrize("pose_errors", [False, True])

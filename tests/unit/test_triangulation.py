@@ -51,8 +51,8 @@ def test_covariances_hold_in_monte_carlo(sigmas_px: tuple[float, ...]) -> None:
     found = triangulate(views, point, view, views.project(view, truth[point]) + noise, sigma, count)
     error = found.points - truth
     ratio = np.einsum("pi,pij,pj->p", error, np.linalg.inv(found.cov), error).mean() / 3.0
-    # 95 % of the mean of 9,000 squares is 1 +- 0.03; Huber weights at 2 sigma make the covariance some 2 % too large.
-    assert 0.94 < ratio < 1.03
+    # 95 % of the mean of 9,000 squares is 1 +- 0.03; with Huber weights at 2 sigma its expectation is 0.995 (measured).
+    assert 0.96 < ratio < 1.03
     empirical = np.cov(error.T)
     np.testing.assert_allclose(np.diag(found.cov.mean(axis=0)), np.diag(empirical), rtol=0.12)
 

@@ -22,7 +22,8 @@ class Adjusted:
 
     problem: Problem  # what passed the gates, image sigmas scaled by their variance component
     solution: Solution
-    posterior: Posterior
+    posterior: Posterior  # with the errors of the reference
+    cofactors: Posterior  # against the reference as it is published
     gates: dict[str, GateCount]
     components: dict[str, Component]
     sigma_scale: float  # of the image observations, against the problem as it was given
@@ -50,8 +51,9 @@ def adjust(problem: Problem, config: AdjustConfig) -> Adjusted:
         solution = solve(problem, cauchy_scale=None, max_iterations=config.max_iterations)
     problem, solution, scale = _rescaled(problem, solution, scale, config)
     gates["image_observations"] = GateCount(given, given - len(problem.observations))
-    components = variance_components(problem, solution, _cofactors(problem, solution))
-    return Adjusted(problem, solution, posterior(problem, solution), gates, components, scale)
+    cofactors = _cofactors(problem, solution)
+    components = variance_components(problem, solution, cofactors)
+    return Adjusted(problem, solution, posterior(problem, solution), cofactors, gates, components, scale)
 
 
 def _cofactors(problem: Problem, solution: Solution) -> Posterior:

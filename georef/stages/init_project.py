@@ -1,0 +1,256 @@
+"""Verb `init`: writes project.toml for a folder of data whose files have the usual names.
+
+    reference_eo.csv  reference/   camera.csv   <epoch>_gnss.csv  <epoch>/   points.csv  marks_<epoch>.csv
+
+What the files declare in their comments is taken over; what nobody says is asked for, never guessed.
+"""
+
+from __future__ import annotations
+
+import json
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, get_args
+
+from georef.config import validated
+from georef.crs import LOCAL, CrsDefinition, choose_origin, crs_kind
+from georef.errors import ConfigError, CrsError, InputError
+from georef.io.columns import POSITION_COLUMNS
+from georef.io.declarations import ANGLE_NAMES, AngleUnit, normalized_crs
+from georef.io.exterior_orientation import exterior_orientation_from_table
+from georef.io.files import write_text_atomically
+from georef.io.tables import Table, read_table
+from georef.project import PROJECT_FILE, ProjectFile
+from georef.types.constraints import CheckKind
+
+ORIENTATION, REFERENCE, CAMERAS, POINTS = "reference_eo.csv", "reference", "camera.csv", "points.csv"
+GNSS_SUFFIX, MARKS_PREFIX = "_gnss.csv", "marks_"
+
+
+@dataclass(frozen=True)
+class Answers:
+    """What the user states; None where the files are to say it."""
+
+    crs: str | None = None
+    height: str | None = None
+    angles: str | None = None
+    angle_unit: str | None = None
+    check_kind: str | None = None
+    name: str | None = None
+    columns: Mapping[str, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Written:
+    """The new file, and a line for each thing that it says and where that comes from."""
+
+    path: Path
+    said: tuple[str, ...]
+
+
+@dataclass
+class _Facts:
+    """What was found out, with its sources."""
+
+    tables: dict[str, Table]
+    values: dict[str, str] = field(default_factory=dict)
+    said: list[str] = field(default_factory=list)
+
+
+def init_project(folder: Path, data: Path, answers: Answers) -> Written:
+    """Writes the project file of a folder of data. Raises ConfigError, InputError, CrsError; overwrites nothing."""
+    path = folder / PROJECT_FILE
+    if path.exists():
+        raise ConfigError(
+            "There is a project already; it stays as it is.",
+            "Edit it, or name another folder for the new project.",
+            f"In {path}.",
+        )
+    epochs = _epochs(data)
+    facts = _Facts(_tables(data, epochs, answers.columns))
+    definition = _definition(facts, answers)
+    origin = _origin(facts, definition, answers)
+    text = _project_text(data, epochs, definition, origin, facts, answers)
+    validated(ProjectFile, tomllib.loads(text), str(path))
+    write_text_atomically(text, path)
+    facts.said.append(f"epochs: {', '.join(epochs)}")
+    return Written(path, tuple(facts.said))
+
+
+def _epochs(data: Path) -> list[str]:
+    """Names of the epochs: of the GNSS tables that stand beside a folder of that name."""
+    if not data.is_dir():
+        raise InputError("The folder of the data does not exist.", remedy="Correct --data.", path=data)
+    missing = [name for name in (ORIENTATION, REFERENCE, CAMERAS) if not (data / name).exists()]
+    if missing:
+        raise InputError(
+            f"The folder has no {' and no '.join(missing)}.",
+            expected=f"{ORIENTATION} (exterior orientation), {REFERENCE}/ (its images), {CAMERAS} (interior orientation).",
+            remedy="Rename the files, or write project.toml by hand: it can name any file.",
+            path=data,
+        )
+    epochs = sorted(p.name.removesuffix(GNSS_SUFFIX) for p in data.glob(f"*{GNSS_SUFFIX}"))
+    epochs = [name for name in epochs if (data / name).is_dir()]
+    if not epochs:
+        raise InputError(
+            "The folder has no new epoch.",
+            expected=f"a table <epoch>{GNSS_SUFFIX} beside a folder <epoch>/ with the new images.",
+            remedy="Rename the files, or write project.toml by hand: an epoch needs no GNSS there.",
+            path=data,
+        )
+    return epochs
+
+
+def _tables(data: Path, epochs: list[str], columns: Mapping[str, str]) -> dict[str, Table]:
+    names = [ORIENTATION, *(f"{epoch}{GNSS_SUFFIX}" for epoch in epochs)]
+    names += [POINTS] if (data / POINTS).is_file() else []
+    return {name: read_table(data / name, columns=columns) for name in names}
+
+
+def _definition(facts: _Facts, answers: Answers) -> CrsDefinition:
+    crs = _stated(facts, "crs", "--crs", None if answers.crs is None else normalized_crs(answers.crs))
+    if crs is None:
+        raise _unknown(facts, "the coordinate reference system", "--crs EPSG:25832, or --crs local for a site system")
+    given = answers.crs or crs
+    height = None
+    if crs != LOCAL and "+" not in given:
+        height = _stated(facts, "height", "--height", answers.height)
+    definition = CrsDefinition(given, height)
+    try:
+        crs_kind(definition)
+    except CrsError as error:
+        raise CrsError(str(error), "State it: --crs, and --height ellipsoidal or --height EPSG:code.") from None
+    facts.values["kind"] = crs_kind(definition)
+    return definition
+
+
+def _origin(facts: _Facts, definition: CrsDefinition, answers: Answers) -> list[float]:
+    """Where the world frame is to stand: in the middle of the reference; reads its exterior orientation."""
+    table = facts.tables[ORIENTATION]
+    _require_axes(facts, table)
+    angles = _stated(facts, "angles", "--angles", answers.angles)
+    convention = next((name for name in ANGLE_NAMES if name == angles), None)
+    if convention is None:
+        options = " or ".join(f"--angles {name}" for name in ANGLE_NAMES)
+        raise _unknown(facts, f"a convention of the angles that can be read ({angles})" if angles else "the angles", options)
+    unit_text = _stated(facts, "angle_unit", "--angle-unit", answers.angle_unit)
+    unit = next((name for name in get_args(AngleUnit) if name == unit_text), None)
+    if unit is None:
+        raise _unknown(facts, "the unit of the angles", "--angle-unit deg, gon or rad")
+    orientation = exterior_orientation_from_table(
+        table, crs_kind=_kind(facts), angles=convention, angle_unit=unit
+    )
+    facts.said.append(f"reference: {len(orientation)} images, {convention} in {unit}")
+    return choose_origin(definition, orientation.positions_in_crs).tolist()
+
+
+def _kind(facts: _Facts) -> Any:
+    return facts.values["kind"]
+
+
+def _require_axes(facts: _Facts, table: Table) -> None:
+    wanted = POSITION_COLUMNS[_kind(facts)]
+    missing = [name for name in wanted if not table.has(name)]
+    if missing:
+        raise InputError(
+            f"The table has no column '{missing[0]}'; its columns are: {', '.join(table.header)}.",
+            expected=f"the columns {', '.join(wanted)}; the order of axes is never guessed.",
+            remedy=f"State which column is which: {' '.join(f'--column {name}=...' for name in missing)}.",
+            path=table.path,
+            row=table.header_row,
+        )
+
+
+def _stated(facts: _Facts, key: str, option: str, answer: str | None) -> str | None:
+    """The value that the option or the files state; InputError where they contradict each other."""
+    value, source = answer, option
+    for name, table in facts.tables.items():
+        own = getattr(table.declared, key)
+        if own is None:
+            continue
+        if value is not None and own != value:
+            raise InputError(
+                f"The file declares {key} = {own!r}, {source} says {value!r}.",
+                expected="one declaration for all files of a project.",
+                remedy=f"Correct {option}, or the comment in the file.",
+                path=table.path,
+                row=table.declared.rows.get(key),
+            )
+        value, source = own, name if source == option and answer is None else source
+    if value is not None:
+        facts.values[key] = value
+        facts.said.append(f"{key}: {value} (stated in {source})")
+    return value
+
+
+def _unknown(facts: _Facts, what: str, options: str) -> InputError:
+    return InputError(
+        f"No file declares {what}, and no option states it.",
+        expected="a comment in the first lines, such as '# CRS: EPSG:25832, height: ellipsoidal. Angles: degrees, "
+        "omega-phi-kappa'.",
+        remedy=f"State it: {options}. It is never guessed.",
+        path=facts.tables[ORIENTATION].path,
+    )
+
+
+def _check_kind(facts: _Facts, answers: Answers) -> str:
+    known = [kind.value for kind in CheckKind]
+    if answers.check_kind in known:
+        return str(answers.check_kind)
+    table = facts.tables[POINTS]
+    if answers.check_kind is None and table.has("kind") and all(table.text("kind")):
+        return CheckKind.RELATIVE.value  # each point says its own
+    raise InputError(
+        f"--check-kind is {answers.check_kind!r}; the table does not say what its check points are independent of.",
+        expected="absolute (surveyed independently of the reference) or relative (derived from the reference).",
+        remedy="State it: --check-kind absolute or --check-kind relative.",
+        path=table.path,
+    )
+
+
+def _project_text(
+    data: Path, epochs: list[str], definition: CrsDefinition, origin: list[float], facts: _Facts, answers: Answers
+) -> str:
+    height = [f"height = {_quoted(definition.height)}"] if definition.height else []
+    mapping = ", ".join(f"{key} = {_quoted(value)}" for key, value in answers.columns.items())
+    table = [f"table = {{ columns = {{ {mapping} }} }}"] if mapping else []
+    lines = [
+        "# File names are relative to the folder of the data: --data DIR, or GEOREF_DATA, or else this folder.",
+        f"name = {_quoted(answers.name or data.resolve().name)}",
+        "",
+        "[crs]",
+        f"horizontal = {_quoted(definition.horizontal)}",
+        *height,
+        f"origin = {json.dumps(origin)}  # of the world frame, in this CRS; fixed, so that all epochs share it",
+        "",
+        "[reference]",
+        f'images = "{REFERENCE}"',
+        f'cameras = "{CAMERAS}"',
+        f'exterior_orientation = "{ORIENTATION}"',
+        f"angles = {_quoted(facts.values['angles'])}",
+        f"angle_unit = {_quoted(facts.values['angle_unit'])}",
+        'sigma = "estimate"  # or { position_m = [0.01, 0.01, 0.02], rotation_deg = [0.01, 0.01, 0.01] }',
+        *table,
+    ]
+    for epoch in epochs:
+        lines += ["", f"[epochs.{_quoted(epoch)}]", f"images = {_quoted(epoch)}", f'cameras = "{CAMERAS}"']
+        lines += [f"gnss = {_quoted(epoch + GNSS_SUFFIX)}", *table]
+    return "\n".join([*lines, *_points_text(data, epochs, facts, answers, table)]) + "\n"
+
+
+def _points_text(data: Path, epochs: list[str], facts: _Facts, answers: Answers, table: list[str]) -> list[str]:
+    marks = {epoch: f"{MARKS_PREFIX}{epoch}.csv" for epoch in epochs}
+    marks = {epoch: name for epoch, name in marks.items() if (data / name).is_file()}
+    if POINTS not in facts.tables or not marks:
+        return []
+    facts.said.append(f"points: {len(facts.tables[POINTS])}, marked in {', '.join(marks)}")
+    named = ", ".join(f"{_quoted(epoch)} = {_quoted(name)}" for epoch, name in marks.items())
+    kind = f'check_kind = "{_check_kind(facts, answers)}"'
+    return ["", "[points]", f'coordinates = "{POINTS}"', f"marks = {{ {named} }}", kind, *table]
+
+
+def _quoted(text: str) -> str:
+    """A TOML string; JSON's escapes are valid there."""
+    return json.dumps(text, ensure_ascii=False)
