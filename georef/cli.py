@@ -5,30 +5,93 @@ Exit codes: 0 done, 1 our error (message only), 2 usage, 3 finished but a qualit
 
 from __future__ import annotations
 
+import json
 import logging
 import sys
+from collections.abc import Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from cyclopts import App, Parameter
 
 from georef import __version__
-from georef.errors import GeorefError
+from georef.cli_weights import weights
+from georef.terminal import exit_code, say
 
 if TYPE_CHECKING:
+    from georef.doctor import Finding
     from georef.executor import Executor
     from georef.project import Project
 
-app = App(name="georef", version=__version__, help="Georeference new images against mapped reference images.")
+app = App(
+    name="georef",
+    version=__version__,
+    help="Georeference new images against mapped reference images.",
+    help_format="plaintext",
+    suppress_keyboard_interrupt=False,
+)
+app.command(weights)
 
+_REPEATED: Any = {"consume_multiple": False, "negative": (), "show_default": False}
 ProjectArgument = Annotated[Path, Parameter(help="Project folder, or its project.toml.")]
 Data = Annotated[Path | None, Parameter(name="--data", help="Folder with the data; else GEOREF_DATA.")]
 Output = Annotated[Path | None, Parameter(name=["--output", "-o"], help="Where all results go; else the project.")]
 Epoch = Annotated[str | None, Parameter(help="Epoch to work on; needed where the project has several.")]
 Preset = Annotated[str | None, Parameter(help="A preset of configs/, or the path of a TOML file.")]
-Settings = Annotated[
-    tuple[str, ...], Parameter(name="--set", help="section.key=value, may be repeated.", consume_multiple=False)
-]
+Settings = Annotated[tuple[str, ...], Parameter(name="--set", help="section.key=value, may be repeated.", **_REPEATED)]
+Crs = Annotated[str | None, Parameter(name="--crs", help="EPSG:code or local; else what the files declare.")]
+Height = Annotated[str | None, Parameter(help="ellipsoidal, or a vertical CRS; else what the files declare.")]
+
+
+@app.command
+def init(
+    folder: Annotated[Path, Parameter(help="Folder of the new project; it may be that of the data.")],
+    *,
+    data: Annotated[Path, Parameter(name="--data", help="Folder with reference_eo.csv, reference/, camera.csv, ...")],
+    crs: Crs = None,
+    height: Height = None,
+    angles: Annotated[
+        Literal["omega-phi-kappa", "yaw-pitch-roll"] | None, Parameter(help="Convention of the reference's angles.")
+    ] = None,
+    angle_unit: Annotated[Literal["deg", "gon", "rad"] | None, Parameter(help="Their unit.")] = None,
+    check_kind: Annotated[
+        Literal["absolute", "relative"] | None, Parameter(help="Check points: surveyed, or from the reference.")
+    ] = None,
+    column: Annotated[
+        tuple[str, ...], Parameter(help="easting=X: which column is which; may be repeated.", **_REPEATED)
+    ] = (),
+    name: Annotated[str | None, Parameter(help="Name of the project; else that of the folder of the data.")] = None,
+) -> int:
+    """Write project.toml for a folder of data with the usual file names."""
+    from georef.stages.init_project import Answers, init_project, parse_columns
+
+    answers = Answers(crs, height, angles, angle_unit, check_kind, name, parse_columns(column))
+    written = init_project(folder, data, answers)
+    say(*written.said, f"written    {written.path}", f"next       georef doctor {folder} --data {data}")
+    return 0
+
+
+@app.command
+def doctor(
+    project: Annotated[Path | None, Parameter(help="Project folder, or its project.toml.")] = None,
+    *,
+    data: Data = None,
+    output: Output = None,
+    preset: Preset = None,
+    set_: Settings = (),
+) -> int:
+    """Check this machine and, if one is named, a project with all its tables."""
+    from georef.doctor import check_machine, check_project, check_space
+
+    levels = _report_findings(check_machine())
+    if project is None:
+        levels |= _report_findings([check_space(Path.cwd())])
+        return int("fail" in levels)
+    from georef.project import open_project
+
+    opened = open_project(project, data=data, output=output, preset=preset, settings=set_)
+    levels |= _report_findings(check_project(opened))
+    return int("fail" in levels)
 
 
 @app.command
@@ -50,9 +113,9 @@ def run(
         cost = (
             "kept" if result.reused else f"{result.timing['cpu_s']:.0f} CPU-s, {result.timing['peak_memory_mb']:.0f} MB"
         )
-        _say(f"{result.stage:<9} {result.summary.line}  [{cost}]")
+        say(f"{result.stage:<9} {result.summary.line}  [{cost}]")
         report = result.summary.data
-    _say(f"results   {opened.published(name)}")
+    _say_published(opened, name)
     return 3 if report is not None and report["images"]["localized"] == 0 else 0
 
 
@@ -67,11 +130,73 @@ def status(
     set_: Settings = (),
 ) -> int:
     """What is done, partial or stale, and why."""
+    from georef.pipeline import DONE
     from georef.pipeline import status as stage_states
 
     opened, name = _open(project, data, output, epoch, preset, set_)
+    say(f"project {opened.file.name}, epoch {name}, results in {opened.output}", "")
+    say(f"{'stage':<9} {'state':<8} why or what", f"{'-' * 9} {'-' * 8} {'-' * 40}")
     for state in stage_states(opened, name):
-        _say(f"{state.stage:<9} {state.state:<8} {state.why}".rstrip())
+        say(f"{state.stage:<9} {state.state:<8} {state.why or _line_of(state.folder / DONE)}".rstrip())
+    return 0
+
+
+@app.command
+def report(
+    project: ProjectArgument,
+    *,
+    data: Data = None,
+    output: Output = None,
+    epoch: Epoch = None,
+) -> int:
+    """Render report.html again from report.json, and say where everything is."""
+    from georef.stages.published import render_again
+
+    opened, name = _open(project, data, output, epoch, None, ())
+    render_again(opened.published(name))
+    _say_published(opened, name)
+    return 0
+
+
+@app.command
+def view(
+    project: ProjectArgument,
+    *,
+    data: Data = None,
+    output: Output = None,
+    epoch: Epoch = None,
+    port: Annotated[int, Parameter(help="Port on 127.0.0.1 that the viewer listens on.")] = 9876,
+) -> int:
+    """Open the recording of an epoch in the rerun viewer."""
+    from georef.stages.report import RECORDING
+    from georef.viewer.show import show_recording
+
+    opened, name = _open(project, data, output, epoch, None, ())
+    show_recording(opened.published(name) / RECORDING, port)
+    return 0
+
+
+@app.command
+def evaluate(
+    *,
+    poses: Annotated[Path, Parameter(help="Poses as georef writes them, or a plain exterior orientation.")],
+    truth: Annotated[Path, Parameter(help="True exterior orientation of the same images.")],
+    truth_sigma: Annotated[
+        str | None, Parameter(help="How well the truth is known: POSITION_M,ROTATION_DEG, 1-sigma per axis.")
+    ] = None,
+    crs: Crs = None,
+    height: Height = None,
+    output: Annotated[
+        Path | None, Parameter(name=["--output", "-o"], help="JSON file; else evaluation.json beside the poses.")
+    ] = None,
+) -> int:
+    """Compare poses with the truth: errors, shares within thresholds, and whether the covariances are true."""
+    from georef.stages.evaluate import describe, evaluate, parse_truth_sigma, write_evaluation
+
+    sigmas = None if truth_sigma is None else parse_truth_sigma(truth_sigma)
+    result = evaluate(poses, truth, crs=crs, height=height, truth_sigmas=sigmas)
+    path = write_evaluation(result, output)
+    say(*describe(result), f"written     {path}")
     return 0
 
 
@@ -102,20 +227,29 @@ def _progress():
     return Bars() if sys.stderr.isatty() else Lines()
 
 
-def _say(text: str) -> None:
-    sys.stdout.write(text + "\n")
-    sys.stdout.flush()
+def _report_findings(findings: Iterable[Finding]) -> set[str]:
+    levels = set()
+    for finding in findings:
+        say(f"{finding.level:<8} {finding.text}")
+        if finding.remedy:
+            say("         " + finding.remedy.replace("\n", "\n         "))
+        levels.add(finding.level)
+    return levels
+
+
+def _line_of(done: Path) -> str:
+    """What a finished stage said of its result."""
+    return json.loads(done.read_text(encoding="utf-8"))["line"] if done.is_file() else ""
+
+
+def _say_published(project: Project, epoch: str) -> None:
+    from georef.stages.published import published_files
+
+    for path, what in published_files(project.published(epoch)):
+        say(f"{path.name:<17} {what:<27} {path}")
 
 
 def main() -> None:
     """The entry point of the command `georef`."""
     logging.basicConfig(level=logging.WARNING, format="%(levelname)s: %(message)s")
-    try:
-        code = app(sys.argv[1:], result_action="return_value", exit_on_error=False)
-    except GeorefError as error:
-        sys.stderr.write(f"{type(error).__name__}: {error}\n")
-        code = 1
-    except KeyboardInterrupt:
-        sys.stderr.write("Interrupted; run the same command again to go on.\n")
-        code = 130
-    sys.exit(code if isinstance(code, int) else 0)
+    sys.exit(exit_code(app, sys.argv[1:]))

@@ -21,46 +21,46 @@ class Section(BaseModel):
 
 class FeaturesConfig(Section):
     extractor: str = "aliked-n16"
-    longest_side_px: int = Field(1024, ge=64)
-    max_keypoints: int = Field(4096, ge=16)
+    longest_side_px: int = Field(default=1024, ge=64)
+    max_keypoints: int = Field(default=4096, ge=16)
 
 
 class MatchingConfig(Section):
     matcher: str = "lightglue-aliked"
-    max_keypoints: int = Field(2048, ge=16)
+    max_keypoints: int = Field(default=2048, ge=16)
     options: dict[str, str | int | float | bool] = {}
 
 
 class CandidatesConfig(Section):
     box: Literal["reach", "published"] = "reach"
-    min_half_side_m: float = Field(15.0, gt=0)
-    viewing_reach_m: float = Field(30.0, gt=0)
-    heading_window_deg: float = Field(90.0, gt=0, le=180)
-    count: int = Field(10, ge=2)
-    first_count: int = Field(4, ge=2)
-    vote_keypoints: int = Field(512, ge=16)
-    max_searched: int = Field(2000, ge=2)
+    min_half_side_m: float = Field(default=15.0, gt=0)
+    viewing_reach_m: float = Field(default=30.0, gt=0)
+    heading_window_deg: float = Field(default=90.0, gt=0, le=180)
+    count: int = Field(default=10, ge=2)
+    first_count: int = Field(default=4, ge=2)
+    vote_keypoints: int = Field(default=512, ge=16)
+    max_searched: int = Field(default=2000, ge=2)
 
 
 class LocalizeConfig(Section):
     method: Literal["query-centred", "published"] = "query-centred"
-    ransac_gate_px: float = Field(12.0, gt=0)
-    guided_gate: float = Field(3.0, gt=0)
-    guided_min_similarity: float = Field(0.6, ge=0, le=1)
-    guided_ratio: float = Field(0.95, gt=0, le=1)
-    min_inliers: int = Field(20, ge=6)
-    min_inlier_ratio: float = Field(0.1, ge=0, le=1)
-    max_position_sigma_m: float = Field(1.0, gt=0)
-    max_correspondences: int = Field(0, ge=0)
+    ransac_gate_px: float = Field(default=12.0, gt=0)
+    guided_gate: float = Field(default=3.0, gt=0)
+    guided_min_similarity: float = Field(default=0.6, ge=0, le=1)
+    guided_ratio: float = Field(default=0.95, gt=0, le=1)
+    min_inliers: int = Field(default=20, ge=6)
+    min_inlier_ratio: float = Field(default=0.1, ge=0, le=1)
+    max_position_sigma_m: float = Field(default=1.0, gt=0)
+    max_correspondences: int = Field(default=0, ge=0)
     seed: int = 0
 
 
 class NetworkConfig(Section):
-    neighbours: int = Field(6, ge=2)
-    max_images: int = Field(40, ge=4)
-    max_points_per_image: int = Field(300, ge=20)
-    max_keypoints: int = Field(2048, ge=64)
-    max_suspect_share: float = Field(0.1, ge=0, le=0.5)
+    neighbours: int = Field(default=6, ge=2)
+    max_images: int = Field(default=40, ge=4)
+    max_points_per_image: int = Field(default=300, ge=20)
+    max_keypoints: int = Field(default=2048, ge=64)
+    max_suspect_share: float = Field(default=0.1, ge=0, le=0.5)
 
 
 class AdjustConfig(Section):
@@ -68,10 +68,10 @@ class AdjustConfig(Section):
     tie_points: bool = True
     gnss: bool = True
     surveyed_control: bool = False
-    max_points_per_image: int = Field(1500, ge=20)
-    cauchy_scale: float = Field(2.0, gt=0)
-    gate_probability: float = Field(0.999, gt=0.5, lt=1)
-    max_iterations: int = Field(30, ge=1)
+    max_points_per_image: int = Field(default=1500, ge=20)
+    cauchy_scale: float = Field(default=2.0, gt=0)
+    gate_probability: float = Field(default=0.999, gt=0.5, lt=1)
+    max_iterations: int = Field(default=30, ge=1)
 
     @field_validator("constraints", mode="before")
     @classmethod
@@ -86,13 +86,13 @@ class AdjustConfig(Section):
 
 class ReportConfig(Section):
     recording: bool = True
-    recording_image_side_px: int = Field(768, ge=64)
-    recording_max_points: int = Field(200_000, ge=0)
+    recording_image_side_px: int = Field(default=768, ge=64)
+    recording_max_points: int = Field(default=200_000, ge=0)
 
 
 class RunConfig(Section):
-    workers: int = Field(1, ge=1)
-    threads: int = Field(0, ge=0)
+    workers: int = Field(default=1, ge=1)
+    threads: int = Field(default=0, ge=0)
 
 
 class Config(Section):

@@ -130,7 +130,7 @@ def _plan(
 
 def _run_stage(stage: Stage, context: StageContext, parts: dict[str, Any]) -> StageResult:
     done = _read_json(context.folder / DONE)
-    if done is not None and report.outputs_exist(context, stage.name):
+    if done is not None and _results_exist(context, stage.name):
         summary = StageSummary(done["line"], done["data"], 0, done["total"])
         return StageResult(stage.name, summary, done["timing"], reused=True)
     context.folder.mkdir(parents=True, exist_ok=True)
@@ -151,6 +151,12 @@ def _run_stage(stage: Stage, context: StageContext, parts: dict[str, Any]) -> St
     return StageResult(stage.name, summary, timing, reused=False)
 
 
+def _results_exist(context: StageContext, stage: str) -> bool:
+    """Whether what a finished stage left is still there: files may have been deleted since."""
+    checks = {"localize": localize.outcomes_exist, "report": report.outputs_exist}
+    return stage not in checks or checks[stage](context)
+
+
 def _state_of(project: Project, epoch: str, stage: Stage, folder: Path, parts: dict[str, Any]) -> StageState:
     if (folder / DONE).is_file():
         return StageState(stage.name, "done", "", folder)
@@ -163,7 +169,8 @@ def _state_of(project: Project, epoch: str, stage: Stage, folder: Path, parts: d
     if not older:
         return StageState(stage.name, "new", "", folder)
     before = _read_json(older[-1] / BEGUN) or {}
-    changed = [key for key in {**before, **parts} if before.get(key) != parts.get(key)]
+    now = json.loads(json.dumps(parts))  # as it is stored: a tuple is a list there
+    changed = [key for key in {**before, **now} if before.get(key) != now.get(key)]
     return StageState(stage.name, "stale", f"changed: {', '.join(changed)}", folder)
 
 

@@ -37,11 +37,9 @@ def search_box(positions: Array, prior: PositionPrior | None, config: Candidates
         return Box(np.arange(len(positions)), True, "no position prior: searched the whole reference")
     offset = np.abs(positions[:, :2] - prior.position_in_world[:2]).max(axis=1)
     sigma = float(np.sqrt(np.linalg.eigvalsh(prior.cov[:2, :2])[-1]))
-    if config.box == "published":
-        asked = sigma
-    else:
-        asked = max(config.min_half_side_m, 3.0 * sigma + config.viewing_reach_m)
-    half_side, needed = asked, min(config.count, len(positions))
+    reach = max(config.min_half_side_m, 3.0 * sigma + config.viewing_reach_m)
+    asked = sigma if config.box == "published" else reach
+    half_side, needed = asked, min(config.count, int(np.isfinite(offset).sum()))
     while np.count_nonzero(offset <= half_side) < needed:
         half_side *= 2.0
     inside = np.flatnonzero(offset <= half_side)

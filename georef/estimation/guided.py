@@ -69,14 +69,18 @@ def guided_matches(a: PosedFeatures, b: PosedFeatures, options: GuidedOptions, k
 
 
 def epipolar_band(a: PosedFeatures, b: PosedFeatures, gate: float) -> NDArray[np.bool_]:
-    """(N, M) pairs whose distance from each other's epipolar line is at most `gate` keypoint scales in both images."""
+    """(N, M) pairs whose distance from each other's epipolar line is at most `gate` keypoint scales in both images.
+
+    Images from one place have no epipolar lines: no pair.
+    """
     f = fundamental_matrix(a, b).astype(np.float32)
     in_a, in_b = _homogeneous(a.ideal_px), _homogeneous(b.ideal_px)
     lines_in_b, lines_in_a = in_a @ f.T, in_b @ f
-    lines_in_b /= np.linalg.norm(lines_in_b[:, :2], axis=1, keepdims=True) * gate
-    lines_in_a /= np.linalg.norm(lines_in_a[:, :2], axis=1, keepdims=True) * gate
-    near_in_b = np.abs(lines_in_b @ in_b.T) <= b.features.scales_px[None, :]
-    near_in_a = np.abs(in_a @ lines_in_a.T) <= a.features.scales_px[:, None]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        lines_in_b /= np.linalg.norm(lines_in_b[:, :2], axis=1, keepdims=True) * gate
+        lines_in_a /= np.linalg.norm(lines_in_a[:, :2], axis=1, keepdims=True) * gate
+        near_in_b = np.abs(lines_in_b @ in_b.T) <= b.features.scales_px[None, :]
+        near_in_a = np.abs(in_a @ lines_in_a.T) <= a.features.scales_px[:, None]
     return near_in_b & near_in_a
 
 

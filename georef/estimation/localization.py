@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+import pycolmap
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
@@ -14,8 +15,8 @@ from georef.config import CandidatesConfig, LocalizeConfig
 from georef.estimation.candidates import Box, in_heading_window, overlap, search_box, vote
 from georef.estimation.guided import GuidedOptions, PosedFeatures, guided_matches
 from georef.estimation.local_model import LocalModel, query_centred_model
-from georef.estimation.pnp import EstimatedPose, QueryImage, ransac_pose, refine_pose, with_covariance
-from georef.estimation.published import published_model
+from georef.estimation.pnp import EstimatedPose, QueryImage, ransac_pose, refine_pose, refit_pose, with_covariance
+from georef.estimation.published import VerifyPair, published_model, verify_pair
 from georef.estimation.reference_map import ReferenceMap
 from georef.features.base import Matcher
 from georef.geometry.covariance import position_cov_in_world
@@ -119,7 +120,6 @@ def _query_centred(work: _Work, ranked: NDArray[np.int64]) -> Outcome:
     with work.timed("pose"):
         references = [work.reference.posed(i) for i in chosen]
         model = query_centred_model(references, matches, work.reference.noise.keypoint_sigma)
-        model = _thinned(model, work.config)
         estimate = refine_pose(pose, work.query, model, lambda v: work.reference.pose_cov(chosen[v]))
     return _outcome(work, estimate, model, chosen)
 
@@ -171,14 +171,13 @@ def _guided(work: _Work, pose: Rigid3, index: int) -> Matches:
 
 def _published(work: _Work, ranked: NDArray[np.int64]) -> Outcome:
     """All pairs among the query and its candidates matched; COLMAP's triangulation from the fixed reference poses."""
-    chosen = [int(i) for i in ranked[: work.candidates.count]]
+    chosen = sorted(int(i) for i in ranked[: work.candidates.count])
     references = [work.reference.posed(i) for i in chosen]
     with work.timed("matching"):
-        model = published_model(work.posed, references, work.matcher, work.match_keypoints, work.reference.noise)
+        model = published_model(references, _pair_verifier(work, chosen, references), work.reference.noise)
     with work.timed("pose"):
         if len(model) < work.config.min_inliers:
             return Rejected(work.image.image_id, RejectReason.FEW_MATCHES, f"{len(model)} triangulated points")
-        model = _thinned(model, work.config)
         found = ransac_pose(work.query, model, work.config.ransac_gate_px, work.config.seed)
         inliers = 0 if found is None else int(found[1].sum())
         if found is None or not _enough(inliers, len(model), work.config):
@@ -188,16 +187,33 @@ def _published(work: _Work, ranked: NDArray[np.int64]) -> Outcome:
     return _outcome(work, estimate, model, chosen)
 
 
+def _pair_verifier(work: _Work, chosen: list[int], references: list[PosedFeatures]) -> VerifyPair:
+    """Pairs of references (chosen in rising order) are verified once for all queries of a process."""
+
+    def verify(a: int, b: int) -> pycolmap.TwoViewGeometry:
+        if b == len(chosen):
+            return verify_pair(references[a], work.posed, work.matcher, work.match_keypoints)
+        key = chosen[a], chosen[b]
+        if key not in work.reference.pairs:
+            geometry = verify_pair(references[a], references[b], work.matcher, work.match_keypoints)
+            work.reference.pairs[key] = geometry
+        return work.reference.pairs[key]
+
+    return verify
+
+
 def _enough(inliers: int, points: int, config: LocalizeConfig) -> bool:
     return inliers >= config.min_inliers and inliers >= config.min_inlier_ratio * points
 
 
-def _thinned(model: LocalModel, config: LocalizeConfig) -> LocalModel:
-    """A random subset of the points where the configuration limits their number."""
-    if not 0 < config.max_correspondences < len(model):
-        return model
-    chosen = np.random.default_rng(config.seed).permutation(len(model))[: config.max_correspondences]
-    return model.take(np.isin(np.arange(len(model)), chosen))
+def _thinned(
+    work: _Work, model: LocalModel, estimate: EstimatedPose, chosen: Sequence[int]
+) -> tuple[LocalModel, EstimatedPose]:
+    """The pose from a random choice of the verified points, where the configuration limits their number."""
+    order = np.random.default_rng(work.config.seed).permutation(len(model))
+    model = model.take(np.isin(np.arange(len(model)), order[: work.config.max_correspondences]))
+    refined = refit_pose(estimate.world_from_cam, work.query, model, lambda v: work.reference.pose_cov(chosen[v]))
+    return model, refined or estimate
 
 
 def _outcome(work: _Work, estimate: EstimatedPose | None, model: LocalModel, chosen: Sequence[int]) -> Outcome:
@@ -212,12 +228,14 @@ def _outcome(work: _Work, estimate: EstimatedPose | None, model: LocalModel, cho
         limit = work.config.max_position_sigma_m
         return Rejected(image_id, RejectReason.DEGENERATE, f"position sigma {sigma:.2f} m, over {limit:g} m")
     used = model.take(estimate.inliers)
+    if 0 < work.config.max_correspondences < len(used):
+        used, estimate = _thinned(work, used, estimate, chosen)
     return Localized(
         image_id=image_id,
         world_from_cam=estimate.world_from_cam,
         world_from_cam_cov=estimate.cov,
         relative_cov=estimate.relative_cov,
-        correspondence_count=inliers,
+        correspondence_count=len(used),
         sigma0=estimate.sigma0,
         matches=_reference_matches(used, [work.reference.images[i].image_id for i in chosen]),
         points_in_world=used.points,

@@ -97,6 +97,15 @@ def refine_pose(
     return with_covariance(pose, query, model, inliers, reference_pose_cov)
 
 
+def refit_pose(
+    start: Rigid3, query: QueryImage, model: LocalModel, reference_pose_cov: Callable[[int], Array]
+) -> EstimatedPose | None:
+    """Least squares on all points of a local model, which are known to be good. None where geometry fails."""
+    everything = np.ones(len(model), bool)
+    pose = _iterate(start, query, model, everything, robust=False)
+    return None if pose is None else with_covariance(pose, query, model, everything, reference_pose_cov)
+
+
 def with_covariance(
     pose: Rigid3,
     query: QueryImage,

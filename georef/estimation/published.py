@@ -6,7 +6,7 @@ the query's keypoints correspond to make the local model.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from itertools import combinations
 
 import numpy as np
@@ -21,42 +21,49 @@ from georef.geometry.triangulation import triangulate
 from georef.types.results import ReferenceNoise
 from georef.types.scene import Observations
 
+VerifyPair = Callable[[int, int], pycolmap.TwoViewGeometry]
+"""The verified matches of two images, by their place in the list of references with the query behind them."""
 
-def published_model(
-    query: PosedFeatures,
-    references: Sequence[PosedFeatures],
-    matcher: Matcher,
-    match_keypoints: int,
-    noise: ReferenceNoise,
-) -> LocalModel:
-    """The local model of a query from its candidates, matched exhaustively: 55 pairs of 11 images."""
-    images = [*references, query]
-    heads = [image.features.head(match_keypoints) for image in images]
-    cameras = [_colmap_camera(image, i) for i, image in enumerate(images)]
+
+def verify_pair(a: PosedFeatures, b: PosedFeatures, matcher: Matcher, match_keypoints: int) -> pycolmap.TwoViewGeometry:
+    """Matches of two images and COLMAP's geometric verification of them; the known poses are not used."""
+    matches = matcher.match(a.features.head(match_keypoints), b.features.head(match_keypoints))
+    indices = matches.indices.astype(np.uint32)
+    options = pycolmap.TwoViewGeometryOptions()
+    options.ransac.random_seed = 0
+    return pycolmap.estimate_calibrated_two_view_geometry(
+        _colmap_camera(a, 1), a.ideal_px, _colmap_camera(b, 2), b.ideal_px, indices, options
+    )
+
+
+def published_model(references: Sequence[PosedFeatures], verify: VerifyPair, noise: ReferenceNoise) -> LocalModel:
+    """The local model of a query from its candidates, all pairs among them verified: 55 pairs of 11 images."""
     graph = pycolmap.CorrespondenceGraph()
-    for index, head in enumerate(heads):
-        graph.add_image(index + 1, len(head))
-    to_query: list[NDArray[np.int64]] = []
-    for a, b in combinations(range(len(images)), 2):
-        matches = matcher.match(heads[a], heads[b]).indices.astype(np.uint32)
-        pixels_a, pixels_b = images[a].ideal_px[: len(heads[a])], images[b].ideal_px[: len(heads[b])]
-        geometry = pycolmap.estimate_calibrated_two_view_geometry(cameras[a], pixels_a, cameras[b], pixels_b, matches)
-        graph.add_two_view_geometry(a + 1, b + 1, geometry)
-        if b == len(references):
-            verified = np.asarray(geometry.inlier_matches, dtype=np.int64).reshape(-1, 2)
-            to_query.append(np.column_stack([np.full(len(verified), a), verified]))
+    for index, image in enumerate(references):
+        graph.add_image(index + 1, len(image.features))
+    for a, b in combinations(range(len(references)), 2):
+        graph.add_two_view_geometry(a + 1, b + 1, verify(a, b))
     graph.finalize()
-    reconstruction = _triangulated(references, heads, cameras, graph)
+    reconstruction = _triangulated(references, graph)
+    to_query = [_with_query(verify(a, len(references)), a) for a in range(len(references))]
     return _model_of_query(references, reconstruction, np.concatenate(to_query), noise)
 
 
-def _triangulated(references, heads, cameras, graph) -> pycolmap.Reconstruction:
+def _with_query(geometry: pycolmap.TwoViewGeometry, reference: int) -> NDArray[np.int64]:
+    """Rows (M, 3): reference, its keypoint, the query's keypoint."""
+    verified = np.asarray(geometry.inlier_matches, dtype=np.int64).reshape(-1, 2)
+    return np.column_stack([np.full(len(verified), reference), verified])
+
+
+def _triangulated(references: Sequence[PosedFeatures], graph: pycolmap.CorrespondenceGraph) -> pycolmap.Reconstruction:
+    """Points from the references at their given poses."""
     reconstruction = pycolmap.Reconstruction()
     for index, reference in enumerate(references):
-        camera = cameras[index]
+        camera = _colmap_camera(reference, index + 1)
         reconstruction.add_camera_with_trivial_rig(camera)
-        points = reference.ideal_px[: len(heads[index])]
-        image = pycolmap.Image(name=str(index), keypoints=points, camera_id=camera.camera_id, image_id=index + 1)
+        image = pycolmap.Image(
+            name=str(index), keypoints=reference.ideal_px, camera_id=camera.camera_id, image_id=index + 1
+        )
         pose = reference.world_from_cam.inverse()
         reconstruction.add_image_with_trivial_frame(image, pycolmap.Rigid3d(pose.matrix()[:3]))
     options = pycolmap.IncrementalTriangulatorOptions()
@@ -102,8 +109,8 @@ def _model_of_query(
     return model.take(np.isfinite(solved.cov).all(axis=(1, 2)))
 
 
-def _colmap_camera(image: PosedFeatures, index: int) -> pycolmap.Camera:
+def _colmap_camera(image: PosedFeatures, camera_id: int) -> pycolmap.Camera:
     c = image.camera
     return pycolmap.Camera(
-        model="PINHOLE", width=c.width, height=c.height, params=[c.fx, c.fy, c.cx, c.cy], camera_id=index + 1
+        model="PINHOLE", width=c.width, height=c.height, params=[c.fx, c.fy, c.cx, c.cy], camera_id=camera_id
     )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -30,6 +31,7 @@ class ReferenceMap:
         self.positions: Array = np.array([pose.translation for pose in self.poses]).reshape(-1, 3)
         forward = np.array([pose.rotation[:, 2] for pose in self.poses]).reshape(-1, 3)
         self.headings_rad: Array = np.arctan2(forward[:, 0], forward[:, 1])
+        self.pairs: dict[tuple[int, int], Any] = {}  # verified pairs of references, filled by the published way
         self._read = read_features
         self._heads: OrderedDict[tuple[int, int], Features] = OrderedDict()
         self._posed: OrderedDict[int, PosedFeatures] = OrderedDict()

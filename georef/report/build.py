@@ -131,8 +131,7 @@ def _sigma(cov: Array, turn: Array) -> list[float]:
 
 
 def _plan(given: ReportInput) -> dict[str, Any]:
-    reports = given.check_after.values() if isinstance(given.check_after, Mapping) else [given.check_after]
-    check = {e.point_id: e.difference_m for report in reports for e in report.errors.determined}
+    check = {e.point_id: e.difference_m for report in given.check_after.values() for e in report.errors.determined}
     control = {c["point"]: np.array(c["residual_m"]) for c in given.adjustment.get("control", [])}
     return plan_section(given.placed, check, control)
 
@@ -166,7 +165,7 @@ def _in_crs_axes(errors: CheckPointErrors, axes: Mapping[str, Array]) -> CheckPo
     determined = tuple(_turned(error, axes[error.point_id]) for error in errors.determined)
     joint = errors.joint_cov
     if joint is not None and determined:
-        turns = block_diag(*(axes[error.point_id] for error in determined))
+        turns = np.asarray(block_diag(*(axes[error.point_id] for error in determined)), dtype=np.float64)
         joint = turns @ joint @ turns.T
     return replace(errors, determined=determined, joint_cov=joint)
 

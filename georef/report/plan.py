@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from georef.crs import WorldFrame
 from georef.geometry.rigid import Array, Rigid3
@@ -66,7 +66,7 @@ def nearest(positions: Array, targets: Array, limit: int) -> NDArray[np.int64]:
         return np.arange(len(positions))
     if not len(targets):
         return np.linspace(0, len(positions) - 1, limit).astype(np.int64)
-    distance, _ = cKDTree(targets).query(positions)
+    distance, _ = KDTree(targets).query(positions)
     return np.sort(np.argsort(distance, kind="stable")[:limit])
 
 

@@ -83,7 +83,7 @@ def write_evaluation(evaluation: Evaluation, path: Path | None = None) -> Path:
 
 
 def parse_truth_sigma(text: str) -> TruthSigmas:
-    """"0.01,0.02": metres and degrees. Raises ConfigError."""
+    """ "0.01,0.02": metres and degrees. Raises ConfigError."""
     try:
         position_m, rotation_deg = (float(part) for part in text.split(","))
         return TruthSigmas(position_m, float(np.deg2rad(rotation_deg)))
@@ -109,8 +109,14 @@ def describe(evaluation: Evaluation) -> list[str]:
     ]
     if errors.mean_offset_m is not None and errors.rmse_offset_m is not None:
         lines.append(f"bias E N H  {_three(errors.mean_offset_m, '+')} mm, RMSE {_three(errors.rmse_offset_m, '')} mm")
-    lines += [f"within      {r.position_m:5.3f} m and {r.rotation_deg:5.2f} deg: {r.percent:5.1f} %" for r in errors.recall]
-    names = (("NEES / dof  ", errors.nees), ("  position  ", errors.nees_position), ("  rotation  ", errors.nees_rotation))
+    lines += [
+        f"within      {r.position_m:5.3f} m and {r.rotation_deg:5.2f} deg: {r.percent:5.1f} %" for r in errors.recall
+    ]
+    names = (
+        ("NEES / dof  ", errors.nees),
+        ("  position  ", errors.nees_position),
+        ("  rotation  ", errors.nees_rotation),
+    )
     return [*lines, *(name + _nees(summary) for name, summary in names)]
 
 
@@ -185,14 +191,12 @@ def _some(names: tuple[str, ...]) -> str:
 
 def _quantiles(quantiles: ErrorQuantiles, scale: float, unit: str, digits: int) -> str:
     def text(value: float) -> str:
-        return "no pose" if np.isinf(value) else f"{scale * value:.{digits}f}"
+        return "infinite" if np.isinf(value) else f"{scale * value:.{digits}f} {unit}"
 
     interval = quantiles.median_interval
     spread = f" (95 %: {text(interval[0])} to {text(interval[1])})" if interval else " (too few for an interval)"
     largest = quantiles.maximum_estimated
-    return f"median {text(quantiles.median)} {unit}{spread}" + (
-        f", largest {text(largest)} {unit}" if np.isfinite(largest) else ""
-    )
+    return f"median {text(quantiles.median)}{spread}" + (f", largest {text(largest)}" if np.isfinite(largest) else "")
 
 
 def _three(values: np.ndarray, sign: str) -> str:

@@ -8,17 +8,18 @@ What the files declare in their comments is taken over; what nobody says is aske
 from __future__ import annotations
 
 import json
+import re
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any, Literal, get_args
 
 from georef.config import validated
 from georef.crs import LOCAL, CrsDefinition, choose_origin, crs_kind
 from georef.errors import ConfigError, CrsError, InputError
 from georef.io.columns import POSITION_COLUMNS
-from georef.io.declarations import ANGLE_NAMES, AngleUnit, normalized_crs
+from georef.io.declarations import ANGLE_NAMES, AngleConvention, AngleUnit, normalized_crs
 from georef.io.exterior_orientation import exterior_orientation_from_table
 from georef.io.files import write_text_atomically
 from georef.io.tables import Table, read_table
@@ -35,9 +36,9 @@ class Answers:
 
     crs: str | None = None
     height: str | None = None
-    angles: str | None = None
-    angle_unit: str | None = None
-    check_kind: str | None = None
+    angles: AngleConvention | None = None
+    angle_unit: AngleUnit | None = None
+    check_kind: Literal["absolute", "relative"] | None = None
     name: str | None = None
     columns: Mapping[str, str] = field(default_factory=dict)
 
@@ -79,6 +80,17 @@ def init_project(folder: Path, data: Path, answers: Answers) -> Written:
     return Written(path, tuple(facts.said))
 
 
+def parse_columns(texts: Iterable[str]) -> dict[str, str]:
+    """ "easting=X" texts: our name of a column to that in the files. Raises ConfigError."""
+    out = {}
+    for text in texts:
+        ours, equals, theirs = (part.strip() for part in text.partition("="))
+        if not (equals and theirs and re.fullmatch(r"[a-z_0-9]+", ours)):
+            raise ConfigError(f"--column {text!r} cannot be read.", "Expected name=column, e.g. --column easting=X.")
+        out[ours] = theirs
+    return out
+
+
 def _epochs(data: Path) -> list[str]:
     """Names of the epochs: of the GNSS tables that stand beside a folder of that name."""
     if not data.is_dir():
@@ -87,7 +99,7 @@ def _epochs(data: Path) -> list[str]:
     if missing:
         raise InputError(
             f"The folder has no {' and no '.join(missing)}.",
-            expected=f"{ORIENTATION} (exterior orientation), {REFERENCE}/ (its images), {CAMERAS} (interior orientation).",
+            expected=f"{ORIENTATION} (poses of the reference), {REFERENCE}/ (its images), {CAMERAS} (the camera).",
             remedy="Rename the files, or write project.toml by hand: it can name any file.",
             path=data,
         )
@@ -131,17 +143,17 @@ def _origin(facts: _Facts, definition: CrsDefinition, answers: Answers) -> list[
     table = facts.tables[ORIENTATION]
     _require_axes(facts, table)
     angles = _stated(facts, "angles", "--angles", answers.angles)
-    convention = next((name for name in ANGLE_NAMES if name == angles), None)
+    convention: AngleConvention | None = next((name for name in ANGLE_NAMES if name == angles), None)
     if convention is None:
         options = " or ".join(f"--angles {name}" for name in ANGLE_NAMES)
-        raise _unknown(facts, f"a convention of the angles that can be read ({angles})" if angles else "the angles", options)
+        raise _unknown(
+            facts, f"a convention of the angles that can be read ({angles})" if angles else "the angles", options
+        )
     unit_text = _stated(facts, "angle_unit", "--angle-unit", answers.angle_unit)
     unit = next((name for name in get_args(AngleUnit) if name == unit_text), None)
     if unit is None:
         raise _unknown(facts, "the unit of the angles", "--angle-unit deg, gon or rad")
-    orientation = exterior_orientation_from_table(
-        table, crs_kind=_kind(facts), angles=convention, angle_unit=unit
-    )
+    orientation = exterior_orientation_from_table(table, crs_kind=_kind(facts), angles=convention, angle_unit=unit)
     facts.said.append(f"reference: {len(orientation)} images, {convention} in {unit}")
     return choose_origin(definition, orientation.positions_in_crs).tolist()
 
@@ -196,14 +208,13 @@ def _unknown(facts: _Facts, what: str, options: str) -> InputError:
 
 
 def _check_kind(facts: _Facts, answers: Answers) -> str:
-    known = [kind.value for kind in CheckKind]
-    if answers.check_kind in known:
-        return str(answers.check_kind)
+    if answers.check_kind is not None:
+        return answers.check_kind
     table = facts.tables[POINTS]
-    if answers.check_kind is None and table.has("kind") and all(table.text("kind")):
+    if table.has("kind") and all(table.text("kind")):
         return CheckKind.RELATIVE.value  # each point says its own
     raise InputError(
-        f"--check-kind is {answers.check_kind!r}; the table does not say what its check points are independent of.",
+        "The table does not say what its check points are independent of.",
         expected="absolute (surveyed independently of the reference) or relative (derived from the reference).",
         remedy="State it: --check-kind absolute or --check-kind relative.",
         path=table.path,
@@ -213,17 +224,32 @@ def _check_kind(facts: _Facts, answers: Answers) -> str:
 def _project_text(
     data: Path, epochs: list[str], definition: CrsDefinition, origin: list[float], facts: _Facts, answers: Answers
 ) -> str:
-    height = [f"height = {_quoted(definition.height)}"] if definition.height else []
     mapping = ", ".join(f"{key} = {_quoted(value)}" for key, value in answers.columns.items())
     table = [f"table = {{ columns = {{ {mapping} }} }}"] if mapping else []
     lines = [
         "# File names are relative to the folder of the data: --data DIR, or GEOREF_DATA, or else this folder.",
         f"name = {_quoted(answers.name or data.resolve().name)}",
+        *_crs_text(definition, origin),
+        *_reference_text(facts, table),
+    ]
+    for epoch in epochs:
+        lines += ["", f"[epochs.{_key(epoch)}]", f"images = {_quoted(epoch)}", f'cameras = "{CAMERAS}"']
+        lines += [f"gnss = {_quoted(epoch + GNSS_SUFFIX)}", *table]
+    return "\n".join([*lines, *_points_text(data, epochs, facts, answers, table)]) + "\n"
+
+
+def _crs_text(definition: CrsDefinition, origin: list[float]) -> list[str]:
+    return [
         "",
         "[crs]",
         f"horizontal = {_quoted(definition.horizontal)}",
-        *height,
+        *([f"height = {_quoted(definition.height)}"] if definition.height else []),
         f"origin = {json.dumps(origin)}  # of the world frame, in this CRS; fixed, so that all epochs share it",
+    ]
+
+
+def _reference_text(facts: _Facts, table: list[str]) -> list[str]:
+    return [
         "",
         "[reference]",
         f'images = "{REFERENCE}"',
@@ -234,10 +260,6 @@ def _project_text(
         'sigma = "estimate"  # or { position_m = [0.01, 0.01, 0.02], rotation_deg = [0.01, 0.01, 0.01] }',
         *table,
     ]
-    for epoch in epochs:
-        lines += ["", f"[epochs.{_quoted(epoch)}]", f"images = {_quoted(epoch)}", f'cameras = "{CAMERAS}"']
-        lines += [f"gnss = {_quoted(epoch + GNSS_SUFFIX)}", *table]
-    return "\n".join([*lines, *_points_text(data, epochs, facts, answers, table)]) + "\n"
 
 
 def _points_text(data: Path, epochs: list[str], facts: _Facts, answers: Answers, table: list[str]) -> list[str]:
@@ -246,7 +268,7 @@ def _points_text(data: Path, epochs: list[str], facts: _Facts, answers: Answers,
     if POINTS not in facts.tables or not marks:
         return []
     facts.said.append(f"points: {len(facts.tables[POINTS])}, marked in {', '.join(marks)}")
-    named = ", ".join(f"{_quoted(epoch)} = {_quoted(name)}" for epoch, name in marks.items())
+    named = ", ".join(f"{_key(epoch)} = {_quoted(name)}" for epoch, name in marks.items())
     kind = f'check_kind = "{_check_kind(facts, answers)}"'
     return ["", "[points]", f'coordinates = "{POINTS}"', f"marks = {{ {named} }}", kind, *table]
 
@@ -254,3 +276,7 @@ def _points_text(data: Path, epochs: list[str], facts: _Facts, answers: Answers,
 def _quoted(text: str) -> str:
     """A TOML string; JSON's escapes are valid there."""
     return json.dumps(text, ensure_ascii=False)
+
+
+def _key(name: str) -> str:
+    return name if re.fullmatch(r"[A-Za-z0-9_-]+", name) else _quoted(name)

@@ -94,6 +94,12 @@ def make_task(context: StageContext) -> LocalizeTask:
     return LocalizeTask(Campaign(reference.epoch, usable), noise, context.before["store"], context.config, failed)
 
 
+def outcomes_exist(context: StageContext) -> bool:
+    """Whether every image of the epoch has a stored outcome."""
+    items = context.folder / ITEMS
+    return all(item_path(items, image.image_id).is_file() for image in context.survey.epoch.images)
+
+
 def read_outcomes(folder: Path, epoch: Campaign) -> list[Outcome]:
     """The outcomes of all images of an epoch, in its order."""
     return [read_outcome(item_path(folder / ITEMS, image.image_id)) for image in epoch.images]

@@ -27,6 +27,7 @@ from georef.stages.network import RESULT as NETWORK_RESULT
 from georef.stages.survey import Survey
 from georef.types.constraints import CheckKind
 from georef.types.results import Localized, Outcome, Rejected
+from georef.viewer.scene import Scene
 
 POSES, LOCALIZATION, REPORT, HTML, RECORDING = (
     "poses.csv",
@@ -51,15 +52,17 @@ def run(context: StageContext) -> StageSummary:
     if context.config.report.recording:
         from georef.viewer.recording import write_recording
 
-        write_recording(context, outcomes, adjusted, report, folder / RECORDING)
+        write_recording(_scene(context, outcomes, adjusted, report), context.config.report, folder / RECORDING)
     return StageSummary(_line(report), _headline(report), 1, 1)
 
 
-def outputs_exist(context: StageContext, stage: str) -> bool:
-    """Whether what the report stage publishes is there, of this very run (others may have been published since)."""
-    if stage != "report":
-        return True
-    path = context.project.published(context.epoch) / REPORT
+def outputs_exist(context: StageContext) -> bool:
+    """Whether all that is published is there, and of this very run (others may have been published since)."""
+    folder = context.project.published(context.epoch)
+    names = (POSES, LOCALIZATION, HTML, *((RECORDING,) if context.config.report.recording else ()))
+    if not all((folder / name).is_file() for name in names):
+        return False
+    path = folder / REPORT
     try:
         stored = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError):
@@ -153,7 +156,9 @@ def _posed_after_pnp(outcomes: Sequence[Outcome], survey: Survey, kind: CheckKin
     ids = tuple(o.image_id for o in localized)
     cameras = tuple(survey.epoch[name].camera for name in ids)
     poses = tuple(o.world_from_cam for o in localized)
-    return PosedImages(ids, cameras, poses, lambda indices: block_diag(*(covs[i] for i in indices)))
+    return PosedImages(
+        ids, cameras, poses, lambda indices: np.asarray(block_diag(*(covs[i] for i in indices)), dtype=np.float64)
+    )
 
 
 def _posed_adjusted(adjusted: AdjustedEpoch, survey: Survey, kind: CheckKind) -> PosedImages:
@@ -183,6 +188,33 @@ def _placed(adjusted: AdjustedEpoch, survey: Survey) -> Placed:
         reference={i.image_id: i.world_from_cam for i in survey.reference.images if i.world_from_cam is not None},
         check=survey.check,
         control=survey.control,
+    )
+
+
+def _scene(
+    context: StageContext, outcomes: Sequence[Outcome], adjusted: AdjustedEpoch, report: dict[str, Any]
+) -> Scene:
+    survey, placed = context.survey, _placed(adjusted, context.survey)
+    turns = _axes_at_points(survey)  # the report's residuals are along the axes of the CRS
+    points = [*report["plan"]["check"], *report["plan"]["control"]]
+    residuals = {p["point_id"]: np.array(p["residual_m"]) for p in points if p["residual_m"] is not None}
+    if report["plan"]["frame"] == "crs":
+        residuals = {name: turns[name].T @ residual for name, residual in residuals.items()}
+    return Scene(
+        title=f"{report['project']}, {context.epoch}",
+        run=f"{report['project']}-{context.epoch}-{context.folder.name}",
+        reference=[(i, i.world_from_cam) for i in survey.reference.images if i.world_from_cam is not None],
+        new=survey.epoch.images,
+        adjusted=placed.new,
+        localized={o.image_id: o.world_from_cam for o in outcomes if isinstance(o, Localized)},
+        rejected=[o for o in outcomes if isinstance(o, Rejected)],
+        position_covs=placed.position_covs,
+        points=adjusted.points,
+        colors_rgb=adjusted.colors_rgb,
+        check=survey.check,
+        control=survey.control,
+        residuals=residuals,
+        report=report,
     )
 
 

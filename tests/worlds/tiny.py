@@ -6,6 +6,7 @@ EPSG:25832 with ellipsoidal heights. The numbers are exact but for the noise tha
 
 from __future__ import annotations
 
+import zlib
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -45,6 +46,7 @@ cameras = "camera.csv"
 exterior_orientation = "reference_eo.csv"
 angles = "omega-phi-kappa"
 angle_unit = "deg"
+sigma = {{ position_m = {[SIGMA_REFERENCE_M] * 3}, rotation_deg = {[SIGMA_REFERENCE_DEG] * 3} }}
 
 [epochs.{EPOCH}]
 images = "{EPOCH}"
@@ -57,7 +59,7 @@ marks = {{ {EPOCH} = "marks_{EPOCH}.csv" }}
 check_kind = "absolute"
 
 [config.features]
-max_keypoints = 1000
+max_keypoints = 700
 
 [config.candidates]
 count = 6
@@ -104,17 +106,24 @@ class TinyWorld:
     frame: WorldFrame
 
 
-def write_tiny_world(folder: Path) -> TinyWorld:
-    """Renders the images and writes all tables and project.toml into a folder, the same on every run."""
+def write_tiny_world(folder: Path, *, rendered: bool = True) -> TinyWorld:
+    """Writes all images, tables and project.toml into a folder, the same on every run.
+
+    rendered = False leaves the image files empty, which is enough for everything that reads tables alone.
+    """
     rng = np.random.default_rng(7)
     frame = WorldFrame.create(CrsDefinition("EPSG:25832", "ellipsoidal"), ORIGIN)
     reference = {f"r{i}.jpg": pose for i, pose in enumerate(_reference_poses())}
     new = {f"n{i}.jpg": pose for i, pose in enumerate(_new_poses())}
-    textures = [texture(*wall.size_m, wall.seed) for wall in WALLS]
+    textures = wall_textures() if rendered else []
     for name, poses in (("reference", reference), (EPOCH, new)):
         (folder / name).mkdir(parents=True, exist_ok=True)
         for image_id, pose in poses.items():
-            save_image(folder / name / image_id, render(pose, textures, rng))
+            path = folder / name / image_id
+            if rendered:
+                save_image(path, render(pose, textures, image_id))
+            else:
+                path.touch()
     (folder / "project.toml").write_text(PROJECT_TOML, encoding="utf-8")
     _write_camera(folder / "camera.csv")
     _write_orientation(folder / "reference_eo.csv", _disturbed(reference, rng), frame)
@@ -122,6 +131,11 @@ def write_tiny_world(folder: Path) -> TinyWorld:
     _write_gnss(folder / f"{EPOCH}_gnss.csv", new, frame, rng)
     _write_points(folder, new, frame, rng)
     return TinyWorld(folder, new, frame)
+
+
+def wall_textures(seed: int = 0) -> list[Image]:
+    """One texture a wall; another seed makes another place of the same shape."""
+    return [texture(*wall.size_m, wall.seed + 100 * seed) for wall in WALLS]
 
 
 def texture(width_m: float, height_m: float, seed: int) -> Image:
@@ -135,18 +149,21 @@ def texture(width_m: float, height_m: float, seed: int) -> Image:
     return np.clip(128 + 32 * out, 0, 255).astype(np.uint8)
 
 
-def render(world_from_cam: Rigid3, textures: list[Image], rng: np.random.Generator) -> Image:
-    """What the camera sees of the walls, with a little noise; the sky is plain."""
+def render(world_from_cam: Rigid3, textures: list[Image], image_id: str) -> Image:
+    """What the camera sees of the walls, with a little noise of its own; the sky is plain."""
+    rng = np.random.default_rng(zlib.crc32(image_id.encode()))
     size = (CAMERA.width, CAMERA.height)
     out = np.full((CAMERA.height, CAMERA.width, 3), 200, np.uint8)
-    metres_from_texture = np.array([[1 / _PX_PER_M, 0, 0.5 / _PX_PER_M], [0, 1 / _PX_PER_M, 0.5 / _PX_PER_M], [0, 0, 1]])
+    metres_from_texture = np.array(
+        [[1 / _PX_PER_M, 0, 0.5 / _PX_PER_M], [0, 1 / _PX_PER_M, 0.5 / _PX_PER_M], [0, 0, 1]]
+    )
     index_from_pixels = np.array([[1.0, 0, -0.5], [0, 1, -0.5], [0, 0, 1]])  # OpenCV counts from the pixel's centre
     for wall, image in zip(WALLS, textures, strict=True):
         homography = index_from_pixels @ wall.pixels_from_texture(world_from_cam) @ metres_from_texture
         seen = cv2.warpPerspective(image, homography, size, flags=cv2.INTER_LINEAR)
         inside = cv2.warpPerspective(np.full(image.shape[:2], 255, np.uint8), homography, size)
-        inside &= _in_front(homography)
-        out[inside > 127] = seen[inside > 127]
+        visible = (np.asarray(inside) > 127) & _in_front(homography)
+        out[visible] = seen[visible]
     noisy = out + rng.normal(0, 2.0, out.shape)
     return np.clip(noisy, 0, 255).astype(np.uint8)
 
@@ -159,12 +176,12 @@ def camera_row(camera: Camera = CAMERA) -> str:
     return f"{camera.camera_id},{camera.width},{camera.height},{camera.fx},{camera.fy},{camera.cx},{camera.cy}"
 
 
-def _in_front(homography: Array) -> Image:
-    """255 where the wall is in front of the camera: the mirrored half of a homography is not seen."""
+def _in_front(homography: Array) -> NDArray[np.bool_]:
+    """Pixels (H, W) whose ray meets the wall in front of the camera, not behind it."""
     x, y = np.meshgrid(np.arange(CAMERA.width), np.arange(CAMERA.height))
     back = np.linalg.inv(homography)
     inverse_depth = back[2, 0] * x + back[2, 1] * y + back[2, 2]
-    return np.where(inverse_depth > 0, 255, 0).astype(np.uint8)
+    return inverse_depth > 0
 
 
 def _pose(x: float, y: float, z: float, yaw: float, pitch: float, roll: float = 0.0) -> Rigid3:
@@ -174,7 +191,9 @@ def _pose(x: float, y: float, z: float, yaw: float, pitch: float, roll: float = 
 def _reference_poses() -> list[Rigid3]:
     """An arc about the corner of the walls, looking into it."""
     return [
-        _pose(-9 + 2.2 * i, -1.5 - 0.9 * i + 0.5 * (i % 3), 3.0 + 0.8 * (i % 2), 34 + 3.0 * i, -4 - (i % 3), 2.0 * (i % 2))
+        _pose(
+            -9 + 2.2 * i, -1.5 - 0.9 * i + 0.5 * (i % 3), 3.0 + 0.8 * (i % 2), 34 + 3.0 * i, -4 - (i % 3), 2.0 * (i % 2)
+        )
         for i in range(8)
     ]
 

@@ -15,11 +15,13 @@ from scipy.stats import chi2
 from georef.estimation.adjustment.posterior import Posterior
 from georef.estimation.adjustment.problem import Problem
 from georef.estimation.adjustment.solve import Solution, solution_views
+from georef.geometry.covariance import position_cov_in_world
 from georef.geometry.projection import linearize
 from georef.geometry.rigid import Array
 from georef.geometry.triangulation import segment_sum
 
 _RANK_TOLERANCE = 0.05
+_MEDIAN = np.array([np.nan, *chi2.ppf(0.5, [1, 2])])  # of chi-square, by degrees of freedom
 
 
 @dataclass(frozen=True)
@@ -30,58 +32,91 @@ class GateCount:
     rejected: int = 0
     rejected_ids: tuple[str, ...] = field(default=())
 
+    def then(self, later: GateCount) -> GateCount:
+        """Both rounds of a gate together: those of the first that the later one rejected as well."""
+        return GateCount(self.tested, self.rejected + later.rejected, self.rejected_ids + later.rejected_ids)
+
+
+def residual_scale(problem: Problem, solution: Solution) -> float:
+    """How large image residuals are against their sigmas, by the median: wrong observations do not count."""
+    return _Tested.at(problem, solution).scale if len(problem.observations) else 1.0
+
 
 def gate_observations(problem: Problem, solution: Solution, probability: float) -> tuple[Problem, int]:
     """The problem without image observations and automatic GCPs that contradict their point, and how many were dropped.
 
     Qvv holds the poses at their solution; the scale of the residuals is taken from their median.
     """
-    obs, gcps, count = problem.observations, problem.gcps, len(problem.points)
+    obs, gcps = problem.observations, problem.gcps
     if not len(obs):
         return problem, 0
-    lin = linearize(solution_views(problem, solution), obs.view, solution.points[obs.point])
-    behind = ~np.isfinite(lin.pixel).all(axis=1)
-    by_point = np.nan_to_num(lin.by_point) / obs.sigma_px[:, None, None]
-    residual = np.nan_to_num((lin.pixel - obs.pixel) / obs.sigma_px[:, None], nan=1e6)
-    normal = segment_sum(np.swapaxes(by_point, 1, 2) @ by_point, obs.point, count) + gcps.information(count)
-    singular = np.linalg.cond(normal) > 1e12
-    normal[singular] = np.eye(3)
-    inverse = np.linalg.inv(normal)
-    statistic, rank = _statistic(residual, np.eye(2) - by_point @ inverse[obs.point] @ np.swapaxes(by_point, 1, 2))
-    scale2 = max(float(np.median(statistic[rank == 2])) / chi2.ppf(0.5, 2), 1e-12) if (rank == 2).any() else 1.0
-    limit = chi2.ppf(probability, np.array([1, 1, 2, 3])) * scale2
-    good = (statistic <= limit[rank]) & ~behind & ~singular[obs.point]
+    tested = _Tested.at(problem, solution)
+    limit = chi2.ppf(probability, np.array([1, 1, 2, 3])) * tested.scale**2
+    good = (tested.statistic <= limit[tested.rank]) & tested.usable
     whitener = np.linalg.inv(np.linalg.cholesky(gcps.cov))
     off = np.einsum("kij,kj->ki", whitener, solution.points[gcps.point] - gcps.position)
-    cofactor = np.eye(3) - whitener @ inverse[gcps.point] @ np.swapaxes(whitener, 1, 2)
+    cofactor = np.eye(3) - whitener @ tested.point_inverse[gcps.point] @ np.swapaxes(whitener, 1, 2)
     statistic, rank = _statistic(off, cofactor)
     gated = problem.with_poses(solution.world_from_cams, solution.points).restricted(good, statistic <= limit[rank])
     return gated, len(obs) - len(gated.observations)
 
 
+@dataclass(frozen=True, eq=False)
+class _Tested:
+    """The statistics of all image observations against their points, poses held at their solution."""
+
+    statistic: Array  # (n,)
+    rank: NDArray[np.int64]  # (n,)
+    usable: NDArray[np.bool_]  # (n,) in front of the camera, and of a point that is determined
+    scale: float  # of the residuals, by the median
+    point_inverse: Array  # (P, 3, 3)
+
+    @staticmethod
+    def at(problem: Problem, solution: Solution) -> _Tested:
+        obs, count = problem.observations, len(problem.points)
+        lin = linearize(solution_views(problem, solution), obs.view, solution.points[obs.point])
+        behind = ~np.isfinite(lin.pixel).all(axis=1)
+        by_point = np.nan_to_num(lin.by_point) / obs.sigma_px[:, None, None]
+        residual = np.nan_to_num((lin.pixel - obs.pixel) / obs.sigma_px[:, None], nan=1e6)
+        normal = segment_sum(np.swapaxes(by_point, 1, 2) @ by_point, obs.point, count)
+        normal = normal + problem.gcps.information(count)
+        singular = np.linalg.cond(normal) > 1e12
+        normal[singular] = np.eye(3)
+        inverse = np.linalg.inv(normal)
+        statistic, rank = _statistic(residual, np.eye(2) - by_point @ inverse[obs.point] @ np.swapaxes(by_point, 1, 2))
+        checked = (rank > 0) & ~behind
+        scale2 = float(np.median(statistic[checked] / _MEDIAN[rank[checked]])) if checked.any() else 1.0
+        scale = float(np.sqrt(max(scale2, 1e-12)))
+        return _Tested(statistic, rank, ~behind & ~singular[obs.point], scale, inverse)
+
+
 def gate_priors(
-    problem: Problem, solution: Solution, posterior: Posterior, probability: float
+    problem: Problem, solution: Solution, cofactors: Posterior, posterior: Posterior, probability: float
 ) -> tuple[Problem, dict[str, GateCount]]:
-    """The problem without pose priors, position priors and control points that contradict the rest."""
+    """The problem without pose priors, position priors and control points that contradict the rest.
+
+    `posterior` has what the references' own errors add, which a prior may differ by as well.
+    """
+    shared = Posterior(posterior.poses - cofactors.poses, posterior.control_points - cofactors.control_points)
     gates: dict[str, GateCount] = {}
     bad_poses = []
     for index, prior in problem.pose_priors.items():
         residual = prior.world_from_cam.local(solution.world_from_cams[index])
-        if not _consistent(residual, prior.cov, posterior.pose(index), probability):
+        if not _consistent(residual, prior.cov + shared.pose(index), cofactors.pose(index), probability):
             bad_poses.append(index)
     bad_positions = []
     for index, prior in problem.position_priors.items():
         pose = solution.world_from_cams[index]
-        fitted = pose.rotation @ posterior.pose(index)[3:, 3:] @ pose.rotation.T
-        if not _consistent(pose.translation - prior.position_in_world, prior.cov, fitted, probability):
+        fitted, more = (position_cov_in_world(pose, part.pose(index)) for part in (cofactors, shared))
+        if not _consistent(pose.translation - prior.position_in_world, prior.cov + more, fitted, probability):
             bad_positions.append(index)
     bad_control = [
         index
         for index, point in enumerate(problem.control)
         if not _consistent(
             solution.control_points[index] - point.point_in_world,
-            point.cov,
-            posterior.control_points[index],
+            point.cov + shared.control_points[index],
+            cofactors.control_points[index],
             probability,
         )
     ]

@@ -21,6 +21,8 @@ from georef.geometry.rigid import Array, right_jacobian_so3
 from georef.geometry.triangulation import segment_sum
 from georef.types.scene import Observations
 
+_NOTHING = 1e-30
+
 
 @dataclass(frozen=True, eq=False)
 class Posterior:
@@ -39,34 +41,50 @@ class Posterior:
         return self.poses[np.ix_(rows, rows)]
 
 
-def posterior(problem: Problem, solution: Solution, *, reference_errors: bool = True) -> Posterior:
-    """Covariances at the solution for the stated sigmas. Raises GeorefError where the datum is not fixed.
+def posterior(problem: Problem, solution: Solution) -> Posterior:
+    """Covariances at the solution for the stated sigmas, with what the references' own errors add through the automatic
+    GCPs. Raises GeorefError where the datum is not fixed."""
+    return posteriors(problem, solution)[1]
 
-    Without `reference_errors` they are the cofactors of the weights alone, which gates and redundancies ask for;
-    with them, what the references' own errors add through the automatic GCPs is part of them.
-    """
-    images, control = len(problem.image_ids), len(problem.control)
-    reduced = _prior_information(problem, solution)
+
+def posteriors(problem: Problem, solution: Solution) -> tuple[Posterior, Posterior]:
+    """The cofactors of the weights alone, which gates and redundancies ask for, and the covariances of `posterior`."""
+    control = control_observations(problem)
     information = problem.gcps.information(len(problem.points))
     tie = _eliminate(problem, solution, problem.observations, solution.points, information)
     weights = np.array([np.linalg.inv(point.cov) for point in problem.control]).reshape(-1, 3, 3)
-    marked = _eliminate(problem, solution, control_observations(problem), solution.control_points, weights)
-    reduced = reduced + tie.reduced + marked.reduced
+    marked = _eliminate(problem, solution, control, solution.control_points, weights)
+    cofactors = _inverse(_prior_information(problem, solution) + tie.reduced + marked.reduced, problem.image_ids)
+    cov = cofactors + _shared_reference_part(problem, tie, cofactors)
+    back = marked.solved.toarray().reshape(len(problem.control), 3, len(cov))
+    cofactor_points, points = (
+        symmetric(marked.point_inverse + back @ poses @ np.swapaxes(back, 1, 2)) for poses in (cofactors, cov)
+    )
+    return Posterior(cofactors, cofactor_points), Posterior(cov, points)
+
+
+def _inverse(reduced: Array, image_ids: tuple[str, ...]) -> Array:
+    """The inverse of the reduced normal matrix (6M, 6M)."""
     try:
         # Scaled to a unit diagonal: radians and metres differ by orders of magnitude.
-        scale = 1.0 / np.sqrt(np.diag(reduced))
+        scale = 1.0 / np.sqrt(np.maximum(np.diag(reduced), _NOTHING))
         factor = cho_factor(reduced * scale[:, None] * scale[None, :])
-        cov = symmetric(cho_solve(factor, np.eye(6 * images)) * scale[:, None] * scale[None, :])
+        return symmetric(cho_solve(factor, np.eye(len(reduced))) * scale[:, None] * scale[None, :])
     except (np.linalg.LinAlgError, ValueError):
+        loose = _loose_images(reduced, image_ids)
         raise GeorefError(
-            "The adjustment has no datum: its constraints do not fix position and rotation of all images.",
+            "The adjustment has no datum: its constraints do not fix position and rotation of all images."
+            if len(loose) in (0, len(image_ids))
+            else f"Too little is left to fix {', '.join(loose[:5])}{' and others' if len(loose) > 5 else ''}.",
             "Use automatic GCPs, pose priors, surveyed control points or GNSS (section [adjust]).",
         ) from None
-    if reference_errors:
-        cov = cov + _shared_reference_part(problem, tie, cov)
-    back = marked.back_substitution.reshape(control, 3, 6 * images)
-    points = marked.point_inverse + back @ cov @ np.swapaxes(back, 1, 2)
-    return Posterior(cov, symmetric(points))
+
+
+def _loose_images(reduced: Array, image_ids: tuple[str, ...]) -> list[str]:
+    """Images that nothing fixes even while all others are held."""
+    own = np.array([reduced[6 * i : 6 * i + 6, 6 * i : 6 * i + 6] for i in range(len(image_ids))])
+    values = np.linalg.eigvalsh(np.nan_to_num(own))
+    return [name for name, (low, *_, high) in zip(image_ids, values, strict=True) if low <= 1e-14 * high]
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,11 +92,6 @@ class _Eliminated:
     reduced: Array  # (6M, 6M) contribution to the reduced normal matrix
     point_inverse: Array  # (P, 3, 3)
     solved: csr_array  # N_pp^-1 W' (3P, 6M)
-
-    @property
-    def back_substitution(self) -> Array:
-        """Dense (3P, 6M), for few points."""
-        return self.solved.toarray()
 
 
 def _eliminate(

@@ -11,10 +11,12 @@ import numpy as np
 from georef.estimation.adjustment.problem import Problem, control_observations
 from georef.geometry.projection import Views
 from georef.geometry.rigid import Array, Rigid3
+from georef.geometry.triangulation import triangulate
 from georef.types.scene import Observations
 
 _STEP_TOLERANCE = 1e-7
 _LAMBDA_INITIAL = 1e-6
+_KNOWN_DEPTH = 0.1  # of its distance: a control point whose marks say less starts at its coordinates
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,9 +102,25 @@ def _initial_values(problem: Problem, images: int, points: int) -> gtsam.Values:
         values.insert(index, _pose3(pose))
     for index, point in enumerate(problem.points):
         values.insert(images + index, point)
-    for index, control in enumerate(problem.control):
-        values.insert(images + points + index, control.point_in_world)
+    for index, position in enumerate(_control_start(problem)):
+        values.insert(images + points + index, position)
     return values
+
+
+def _control_start(problem: Problem) -> Array:
+    """Where control points (C, 3) start: intersected from their marks, so that a robust loss can tell wrong coordinates
+    from wrong marks; at their coordinates where the marks do not say."""
+    marks, given = control_observations(problem), np.array([c.point_in_world for c in problem.control]).reshape(-1, 3)
+    if not len(marks):
+        return given
+    found = triangulate(problem.views, marks.point, marks.view, marks.pixel, marks.sigma_px, len(given))
+    sigma = np.sqrt(np.trace(np.nan_to_num(found.cov), axis1=1, axis2=2))
+    nearest = np.full(len(given), np.inf)
+    np.minimum.at(
+        nearest, marks.point, np.linalg.norm(found.points[marks.point] - problem.views.centres[marks.view], axis=1)
+    )
+    known = np.isfinite(found.points).all(axis=1) & (sigma < _KNOWN_DEPTH * nearest)
+    return np.where(known[:, None], found.points, given)
 
 
 def _optimize(
