@@ -95,7 +95,8 @@ class StageResult:
 def run_pipeline(project: Project, epoch: str, executor: Executor) -> Iterator[StageResult]:
     """Runs what is not done, stage by stage. Raises GeorefError."""
     survey = load_survey(project, epoch)
-    for stage, folder, parts, before in _plan(project, epoch, survey):
+    plan = list(_plan(project, epoch, survey))  # as a whole: a component that cannot be made fails before any work
+    for stage, folder, parts, before in plan:
         yield _run_stage(stage, StageContext(project, project.config, epoch, survey, executor, folder, before), parts)
 
 

@@ -32,6 +32,8 @@ _START_POSITION_M, _START_ROTATION_RAD, START_KEYPOINT = 0.01, 3e-4, 0.5
 _LEAST_POSITION_M, _LEAST_ROTATION_RAD = 1e-4, 1e-6
 _ROUNDS, _SETTLED = 10, 0.03
 _LEAST_POINTS = 30
+_LOOSE = 5.0  # times the sigmas of poses, for the gate of the tracks
+_LEAST_MATCHED, _CONTRADICTED = 20, 0.5  # observations of an image; its share of them that is used against the usual
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,16 +108,18 @@ def estimate_noise(
     noise = declared or ReferenceNoise(
         START_KEYPOINT, (_START_POSITION_M,) * 3, (_START_ROTATION_RAD,) * 3, "estimated"
     )
-    problem = _problem(images, matches, config, noise)
-    suspects: list[int] = []
+    limit = config.max_suspect_share * len(images)
+    problem, suspects = _problem(images, matches, config, noise)
+    suspects = suspects[: int(limit)]
+    problem = _set_aside(problem, suspects)
     while True:
         noise, adjusted = _iterated(problem, noise, adjust_config, estimate_poses=declared is None)
         cofactors = posterior(adjusted.problem, adjusted.solution)
         worst = worst_orientation(adjusted.problem, adjusted.solution, cofactors, adjust_config.gate_probability)
-        if worst is None or len(suspects) >= config.max_suspect_share * len(images):
+        if worst is None or len(suspects) >= limit:
             break
         suspects.append(worst)
-        problem = _without_orientation(_continued(adjusted, noise), worst)
+        problem = _set_aside(_continued(adjusted, noise), [worst])
     return NetworkResult(
         noise,
         adjusted.components,
@@ -139,16 +143,22 @@ def _iterated(
     return noise, adjusted
 
 
-def _without_orientation(problem: Problem, index: int) -> Problem:
-    return replace(problem, orientations={i: o for i, o in problem.orientations.items() if i != index})
+def _set_aside(problem: Problem, images: Sequence[int]) -> Problem:
+    """The problem without the observations of some images; their orientations stay, with nothing to contradict."""
+    return problem.restricted(~np.isin(problem.observations.view, images), np.zeros(0, bool))
 
 
 def _problem(
     images: Sequence[PosedFeatures], matches: Sequence[PairMatches], config: NetworkConfig, noise: ReferenceNoise
-) -> Problem:
-    count, observations = build_tracks(images, matches, noise.keypoint_sigma)
-    covs = [noise.pose_cov(image.world_from_cam) for image in images]
-    points, observations = triangulated_tracks(count, observations, images, covs)
+) -> tuple[Problem, list[int]]:
+    """The problem, and the images whose matches the poses contradict so grossly that hardly any took part, worst first.
+
+    Tracks are gated loosely: the sigmas of the poses are not known yet, and wrong poses are to be found.
+    """
+    count, matched = build_tracks(images, matches, noise.keypoint_sigma)
+    covs = [_LOOSE**2 * noise.pose_cov(image.world_from_cam) for image in images]
+    points, observations = triangulated_tracks(count, matched, images, covs)
+    suspects = _contradicting(matched.view, observations.view, len(images))
     sizes = np.array([[image.camera.width, image.camera.height] for image in images], dtype=float)
     keep = distributed(observations, sizes, np.ones(len(images), bool), config.max_points_per_image)
     points, observations = select_points(points, observations, keep)
@@ -158,7 +168,7 @@ def _problem(
             f"Expected at least {_LEAST_POINTS} points seen by two or more reference images.",
             "Declare it in project.toml: [reference] sigma = { position_m = [...], rotation_deg = [...] }.",
         )
-    return Problem(
+    problem = Problem(
         image_ids=tuple(str(i) for i in range(len(images))),
         cameras=tuple(image.camera for image in images),
         world_from_cams=tuple(image.world_from_cam for image in images),
@@ -166,6 +176,16 @@ def _problem(
         observations=observations,
         orientations={i: _orientation(image, noise) for i, image in enumerate(images)},
     )
+    return problem, suspects
+
+
+def _contradicting(matched: NDArray[np.int64], used: NDArray[np.int64], count: int) -> list[int]:
+    """Images that lose far more of their observations (by view index) to the geometry than others, worst first."""
+    before, after = np.bincount(matched, minlength=count), np.bincount(used, minlength=count)
+    share = after / np.maximum(before, 1)
+    usual = float(np.median(share[before > 0])) if (before > 0).any() else 0.0
+    suspicious = (before >= _LEAST_MATCHED) & (share < _CONTRADICTED * usual)
+    return [int(i) for i in np.argsort(share, kind="stable") if suspicious[i]]
 
 
 def _orientation(image: PosedFeatures, noise: ReferenceNoise) -> Orientation:
@@ -187,13 +207,8 @@ def _continued(adjusted: Adjusted, noise: ReferenceNoise) -> Problem:
 
 def _updated(noise: ReferenceNoise, adjusted: Adjusted, *, estimate_poses: bool) -> tuple[ReferenceNoise, float]:
     """The sigmas times the square roots of their components, and the largest relative change."""
-    position = adjusted.components["reference_position"].factor if estimate_poses else 1.0
-    rotation = adjusted.components["reference_rotation"].factor if estimate_poses else 1.0
-    if position is None or rotation is None:
-        raise StageError(
-            "The reference images overlap too little to estimate the sigma of their exterior orientation.",
-            "Declare it in project.toml: [reference] sigma = { position_m = [...], rotation_deg = [...] }.",
-        )
+    position = _factor(adjusted, "reference_position", noise) if estimate_poses else 1.0
+    rotation = _factor(adjusted, "reference_rotation", noise) if estimate_poses else 1.0
     new_position = max(noise.position_sigma_m[0] * position, _LEAST_POSITION_M)
     new_rotation = max(noise.rotation_sigma_rad[0] * rotation, _LEAST_ROTATION_RAD)
     change = max(
@@ -205,3 +220,16 @@ def _updated(noise: ReferenceNoise, adjusted: Adjusted, *, estimate_poses: bool)
     if estimate_poses:
         updated = replace(updated, position_sigma_m=(new_position,) * 3, rotation_sigma_rad=(new_rotation,) * 3)
     return updated, change
+
+
+def _factor(adjusted: Adjusted, group: str, noise: ReferenceNoise) -> float:
+    """Estimated over stated sigma; 1 where an estimated sigma is so small that the keypoints do not show it any more."""
+    factor = adjusted.components[group].factor
+    if factor is not None:
+        return factor
+    if noise.position_sigma_m[0] == _START_POSITION_M and noise.rotation_sigma_rad[0] == _START_ROTATION_RAD:
+        raise StageError(
+            "The reference images overlap too little to estimate the sigma of their exterior orientation.",
+            "Declare it in project.toml: [reference] sigma = { position_m = [...], rotation_deg = [...] }.",
+        )
+    return 1.0

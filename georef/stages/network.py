@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from georef.errors import StageError
 from georef.estimation.guided import GuidedOptions, PosedFeatures
 from georef.estimation.reference_network import (
     START_KEYPOINT,
@@ -72,7 +73,14 @@ def read_noise(folder: Path) -> tuple[ReferenceNoise, tuple[str, ...]]:
 def _usable_reference(context: StageContext) -> list[Image]:
     failed = context.before["features"] / "stage.json"
     skipped = json.loads(failed.read_text(encoding="utf-8"))["data"]["failed"]
-    return [image for image in context.survey.reference.images if feature_id(image) not in skipped]
+    usable = [image for image in context.survey.reference.images if feature_id(image) not in skipped]
+    if len(usable) < 2:
+        raise StageError(
+            f"Only {len(usable)} of {len(context.survey.reference.images)} reference images can be used.",
+            "Expected at least two that can be read and have the size of their camera.",
+            "Correct the images, or the camera table; the stage `features` lists what is wrong with each.",
+        )
+    return usable
 
 
 def _pose(image: Image) -> Rigid3:

@@ -107,7 +107,10 @@ def _reference(project: Project, orientation: ExteriorOrientationTable, world: W
     folder = project.data(section.images)
     files = _image_files(folder)
     _match_images(orientation, files, folder, skip=section.unmatched == "skip")
-    cameras = read_cameras(project.data(section.cameras)) if section.cameras else None
+    cameras = None
+    if section.cameras:
+        cameras_path = project.data(section.cameras)
+        cameras = read_cameras(cameras_path), cameras_path
     poses = world_poses(world, orientation.positions_in_crs, orientation.axes_from_cam)
     images = []
     for index, (name, pose) in enumerate(zip(orientation.image_ids, poses, strict=True)):
@@ -150,7 +153,11 @@ def _image_files(folder: Path) -> dict[str, Path]:
 
 
 def _camera(
-    orientation: ExteriorOrientationTable, index: int, cameras: dict[str, Camera] | None, path: Path, name: str
+    orientation: ExteriorOrientationTable,
+    index: int,
+    cameras: tuple[dict[str, Camera], Path] | None,
+    path: Path,
+    name: str,
 ) -> Camera:
     """The camera of an image: from its own intrinsics columns, else the only or the named one of the camera table."""
     if orientation.intrinsics is not None:
@@ -164,7 +171,7 @@ def _camera(
             remedy='Name one in project.toml: [reference] cameras = "camera.csv".',
             path=orientation.path,
         )
-    return single_camera(cameras, orientation.path)
+    return single_camera(*cameras)
 
 
 def single_camera(cameras: dict[str, Camera], path: Path) -> Camera:

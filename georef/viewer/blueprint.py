@@ -25,17 +25,7 @@ def default_blueprint(
     image_paths: name and entity path of each new image; into_images: entities that are projected into them; hidden:
     entities that are there but switched off.
     """
-    scene = rrb.Spatial3DView(
-        origin="/world",
-        name="Scene",
-        overrides={path: rrb.EntityBehavior(visible=False) for path in hidden},
-        eye_controls=rrb.EyeControls3D(
-            kind=rrb.Eye3DKind.Orbital,
-            position=middle + extent_m * _VIEW_FROM,
-            look_target=middle,
-            eye_up=[0.0, 0.0, 1.0],
-        ),
-    )
+    scene = _scene_view(hidden, middle, extent_m)
     images = [_image_view(name, path, into_images) for name, path in image_paths[:_MOST_IMAGE_TABS]]
     texts = rrb.Tabs(
         rrb.TextDocumentView(origin="/summary", name="Summary"),
@@ -45,6 +35,20 @@ def default_blueprint(
     side = rrb.Vertical(rrb.Tabs(*images, active_tab=0), texts, row_shares=[3, 2]) if images else texts
     return rrb.Blueprint(
         rrb.Horizontal(scene, side, column_shares=[3, 2]), collapse_panels=True, auto_views=False, auto_layout=False
+    )
+
+
+def _scene_view(hidden: Sequence[str], middle: Array, extent_m: float) -> rrb.Spatial3DView:
+    return rrb.Spatial3DView(
+        origin="/world",
+        name="Scene",
+        overrides={path: rrb.EntityBehavior(visible=False) for path in hidden},
+        eye_controls=rrb.EyeControls3D(
+            kind=rrb.Eye3DKind.Orbital,
+            position=middle + extent_m * _VIEW_FROM,
+            look_target=middle,
+            eye_up=[0.0, 0.0, 1.0],
+        ),
     )
 
 

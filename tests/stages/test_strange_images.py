@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 import pytest
 
+from georef.errors import StageError
 from georef.geometry.angles import rotation_from_yaw_pitch_roll
 from georef.geometry.rigid import Rigid3
 from georef.io.items import item_path, read_outcome
@@ -119,6 +120,11 @@ def test_no_image_at_all_can_be_used(copied: Callable[..., Bench]) -> None:
     results = bench.run()
     assert results["report"].summary.data["images"]["localized"] == 0
     assert all(",rejected: few_features" in row for row in _rows(bench.published("poses.csv")).values())
+
+
+def test_a_reference_that_cannot_be_read_is_said(tiny_tables: Path) -> None:
+    with pytest.raises(StageError, match=r"Only 0 of 8 reference images can be used\."):
+        Bench(tiny_tables, tiny_tables).run()
 
 
 def _rows(table: bytes) -> dict[str, str]:

@@ -22,7 +22,6 @@ from tests.worlds.blocks import Block, block, control, gnss, pose_priors, withou
 from tests.worlds.points import NOISE, scaled_noise
 
 _CONFIG = AdjustConfig()
-_SEEDS = 50
 
 
 @dataclass(frozen=True)
@@ -51,9 +50,9 @@ def outcome(made: Block, adjusted: Adjusted) -> Outcome:
 
 
 @lru_cache
-def outcomes(pose_errors: float) -> list[Outcome]:
+def outcomes(pose_errors: float, seeds: int = 50) -> list[Outcome]:
     noise = scaled_noise(NOISE, poses=pose_errors)
-    blocks = [block(seed, noise=noise, points=150) for seed in range(_SEEDS)]
+    blocks = [block(seed, noise=noise, points=150) for seed in range(seeds)]
     return [outcome(made, adjust(made.problem, _CONFIG)) for made in blocks]
 
 
@@ -74,16 +73,15 @@ def test_joint_covariances_of_all_poses_are_honest() -> None:
 
 
 def test_reference_errors_that_dominate_leave_covariances_on_the_safe_side() -> None:
-    found = outcomes(1.0)
+    found = outcomes(1.0, 24)
     _, high = mean_interval(found)
     mean = np.mean([o.nees_ratio for o in found])
     assert 0.7 < mean < high, mean
     assert np.mean([o.naive_ratio for o in found]) > 3.0
 
 
-@pytest.mark.parametrize("pose_errors", [0.5, 1.0])
-def test_errors_are_as_large_as_predicted(pose_errors: float) -> None:
-    found = outcomes(pose_errors)
+def test_errors_are_as_large_as_predicted() -> None:
+    found = outcomes(0.5)
     ratio = np.sqrt(np.mean([o.square_m2 for o in found]) / np.mean([o.predicted_m2 for o in found]))
     assert 0.8 < ratio < 1.2, ratio
 
@@ -135,8 +133,7 @@ def test_planted_blunders_are_rejected_and_healthy_constraints_kept(kind: str, o
     assert 0.5 < np.mean(ratios) < 1.5, np.mean(ratios)
 
 
-def test_half_of_the_pose_priors_wrong_by_the_same_shift() -> None:
-    """Three of eight, all to the same side."""
+def test_three_of_eight_pose_priors_wrong_by_the_same_shift_are_found() -> None:
     made, rng = block(21, queries=8, points=150), np.random.default_rng(21)
     adjusted = adjust(
         replace(without_gcps(made.problem), pose_priors=pose_priors(made.world, rng, {0, 1, 2}, 1.5)), _CONFIG

@@ -33,12 +33,6 @@ def fail_at_two(item: int) -> int:
     return item
 
 
-def die_at_two(item: int) -> int:
-    if item == 2:
-        os._exit(9)
-    return item
-
-
 @dataclass
 class Counting:
     """A progress that counts."""
@@ -90,9 +84,3 @@ def test_a_fault_of_our_own_is_raised_after_the_results_before_it(workers: int) 
         taken.extend(results)
     assert taken == [0, 1]
     assert progress.seen[-1] == "end"
-
-
-def test_results_that_nobody_takes_leave_no_process_behind() -> None:
-    results = Executor(workers=2, threads=1).map_items(Slow(0), list(range(20)), "left")
-    next(results)
-    results.close()  # type: ignore[attr-defined]

@@ -137,14 +137,14 @@ def _optimize(
         optimizer.iterate()
         after = _poses(optimizer.values(), images)
         # LM's own test stops early along weak datum modes: the largest change of a pose decides.
-        step = max((float(np.abs(a.local(b)).max()) for a, b in zip(before, after, strict=True)), default=0.0)
+        step = float(np.abs(after - before).max(initial=0.0))  # m, and rad to first order
         before = after
         if step < _STEP_TOLERANCE:
             converged = True
             break
     solved = optimizer.values()
     return Solution(
-        world_from_cams=tuple(before),
+        world_from_cams=tuple(Rigid3.from_matrix(matrix) for matrix in before),
         points=np.array([solved.atPoint3(images + i) for i in range(points)]).reshape(-1, 3),
         control_points=np.array([solved.atPoint3(images + points + i) for i in range(len(problem.control))]).reshape(
             -1, 3
@@ -154,8 +154,9 @@ def _optimize(
     )
 
 
-def _poses(values: gtsam.Values, images: int) -> list[Rigid3]:
-    return [Rigid3.from_matrix(values.atPose3(index).matrix()) for index in range(images)]
+def _poses(values: gtsam.Values, images: int) -> Array:
+    """world_from_cam of all images (M, 4, 4)."""
+    return np.array([values.atPose3(index).matrix() for index in range(images)]).reshape(-1, 4, 4)
 
 
 def _pose3(pose: Rigid3) -> gtsam.Pose3:
