@@ -68,7 +68,8 @@ class AdjustConfig(Section):
     tie_points: bool = True
     gnss: bool = True
     surveyed_control: bool = False
-    max_points_per_image: int = Field(default=1500, ge=20)
+    max_gcps_per_image: int = Field(default=1500, ge=20)
+    max_tie_points_per_image: int = Field(default=100, ge=20)
     cauchy_scale: float = Field(default=2.0, gt=0)
     gate_probability: float = Field(default=0.999, gt=0.5, lt=1)
     max_iterations: int = Field(default=30, ge=1)

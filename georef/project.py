@@ -31,7 +31,7 @@ class TableSection(Section):
     delimiter: str | None = None
     decimal: Literal[".", ","] | None = None
     encoding: str | None = None
-    columns: dict[str, str] = {}
+    columns: dict[str, str] = Field(default_factory=dict)
 
 
 class ReferenceSigma(Section):
@@ -80,7 +80,7 @@ class ProjectFile(Section):
     epochs: dict[str, EpochSection] = Field(min_length=1)
     points: PointsSection | None = None
     preset: str = "default"
-    config: dict[str, Any] = {}
+    config: dict[str, Any] = Field(default_factory=dict)
 
     @field_validator("epochs")
     @classmethod
@@ -150,7 +150,7 @@ def open_project(
 ) -> Project:
     """Reads and validates a project (its folder or its project.toml). Raises ConfigError.
 
-    The data root is `data`, else GEOREF_DATA (either may also be its parent), else the project's folder.
+    The data root is `data`, else GEOREF_DATA (either may be its parent), else the project's own folder.
     """
     path = where / PROJECT_FILE if where.is_dir() or not where.suffix else where
     if not path.is_file():
@@ -175,10 +175,13 @@ def _split_overrides(overrides: Mapping[str, Any]) -> tuple[dict[str, Any], dict
 
 
 def _data_root(file: ProjectFile, folder: Path, data: Path | None) -> Path:
-    """The named folder, or its sub-folder of the project's name, whichever holds the reference's exterior orientation."""
+    """The named folder, or its sub-folder of the project's name: whichever holds the exterior orientation."""
     environment = os.environ.get("GEOREF_DATA")
-    named = data or (Path(environment) if environment else None)
-    tried = [named, named / folder.name] if named else [folder]
+    if data:
+        tried = [data, data / folder.name]
+    else:
+        named = Path(environment) if environment else None
+        tried = [*([named, named / folder.name] if named else []), folder]
     for root in tried:
         if (root / file.reference.exterior_orientation).is_file():
             return root.resolve()

@@ -103,9 +103,16 @@ def _points(posed, matches, covs, keypoint_sigma, new_count, config):
     points, observations = triangulated_tracks(count, observations, posed, covs)
     sizes = np.array([[p.camera.width, p.camera.height] for p in posed], dtype=float)
     is_new = np.arange(len(posed)) < new_count
-    in_new = np.bincount(observations.point[observations.view < new_count], minlength=len(points)) > 0
-    keep = distributed(observations, sizes, is_new, config.max_points_per_image)
-    return select_points(points, observations, keep & in_new)
+    in_new = np.bincount(observations.point[observations.view < new_count], minlength=len(points))
+    gcp = np.bincount(observations.point[observations.view >= new_count], minlength=len(points)) >= 2
+    keep = np.zeros(len(points), bool)
+    for kind, budget in (
+        (gcp & (in_new >= 1), config.max_gcps_per_image),
+        (~gcp & (in_new >= 2), config.max_tie_points_per_image),
+    ):
+        chosen = distributed(observations.take(kind[observations.point]), sizes, is_new, budget)
+        keep[: len(chosen)] |= chosen
+    return select_points(points, observations, keep)
 
 
 def _automatic_gcps(

@@ -63,7 +63,7 @@ def triangulate_consistent(
 ) -> LocalModel:
     """Points from their consistent observations: inconsistent ones are dropped, the worst of each point first."""
     count = len(keypoint)
-    obs = observations
+    obs, worst = observations, np.zeros(count)
     for _ in range(_ROUNDS):
         obs = obs.take(np.bincount(obs.point, minlength=count)[obs.point] >= 2)
         solved = triangulate(views, obs.point, obs.view, obs.pixel, obs.sigma_px, count)
@@ -76,7 +76,7 @@ def triangulate_consistent(
             break
         obs = obs.take(~bad)
     else:
-        obs = obs.take((np.bincount(obs.point, minlength=count)[obs.point] >= 2) & (worst <= gate)[obs.point])
+        obs = obs.take((np.bincount(obs.point, minlength=count)[obs.point] >= 2) & (worst[obs.point] <= gate))
         solved = triangulate(views, obs.point, obs.view, obs.pixel, obs.sigma_px, count)
     model = LocalModel(keypoint, solved.points, solved.cov, views, obs)
     return model.take(_well_determined(model))
@@ -86,18 +86,19 @@ def _gather(
     references: Sequence[PosedFeatures], matches: Sequence[Matches], keypoint_sigma: float
 ) -> tuple[NDArray[np.int64], Observations]:
     """Query keypoints with a match, and all reference observations of them."""
-    query = np.concatenate([m.indices[:, 0] for m in matches] or [np.zeros(0)]).astype(np.int64)
+    nothing = np.zeros((0, 2), np.int64)
+    pairs = np.concatenate([m.indices for m in matches] or [nothing]).astype(np.int64)
     view = np.repeat(np.arange(len(matches)), [len(m) for m in matches])
-    pixel = np.concatenate([r.ideal_px[m.indices[:, 1]] for r, m in zip(references, matches, strict=True)] or [[]])
-    scale = np.concatenate([r.features.scales_px[m.indices[:, 1]] for r, m in zip(references, matches, strict=True)])
-    other = np.concatenate([m.indices[:, 1] for m in matches]).astype(np.int64)
-    keypoint, point = np.unique(query, return_inverse=True)
-    return keypoint, Observations(point, view, pixel.reshape(-1, 2), keypoint_sigma * scale.astype(float), other)
+    both = list(zip(references, (m.indices[:, 1] for m in matches), strict=True))
+    pixel = np.concatenate([r.ideal_px[k] for r, k in both] or [nothing.astype(float)])
+    scale = np.concatenate([r.features.scales_px[k] for r, k in both] or [np.zeros(0)]).astype(np.float64)
+    keypoint, point = np.unique(pairs[:, 0], return_inverse=True)
+    return keypoint, Observations(point, view, pixel, keypoint_sigma * scale, pairs[:, 1])
 
 
 def _well_determined(model: LocalModel) -> NDArray[np.bool_]:
     """Points whose distance from the references is known to a few per cent."""
-    finite = np.isfinite(model.points).all(axis=1) & np.isfinite(model.cov).all(axis=(1, 2))
+    finite = np.asarray(np.isfinite(model.points).all(axis=1) & np.isfinite(model.cov).all(axis=(1, 2)))
     obs = model.observations
     distance = np.full(len(model), np.inf)
     to_points = np.linalg.norm(model.points[obs.point] - model.views.centres[obs.view], axis=1)

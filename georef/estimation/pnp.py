@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import cast
 
 import numpy as np
 import pycolmap
@@ -44,7 +45,9 @@ class EstimatedPose:
     sigma0: float  # a-posteriori over a-priori standard deviation of an observation
 
 
-def ransac_pose(query: QueryImage, model: LocalModel, gate_px: float, seed: int) -> tuple[Rigid3, Array] | None:
+def ransac_pose(
+    query: QueryImage, model: LocalModel, gate_px: float, seed: int
+) -> tuple[Rigid3, NDArray[np.bool_]] | None:
     """Pose by COLMAP's LO-RANSAC (P3P, EPnP) and its refinement, with the inliers (P,); None without consensus."""
     camera = pycolmap.Camera(
         model="PINHOLE",
@@ -119,7 +122,7 @@ def with_covariance(
     normal = system.normal()
     if np.linalg.eigvalsh(normal)[0] <= 0:
         return None
-    cov_unit = np.linalg.inv(normal)
+    cov_unit = cast(Array, np.linalg.inv(normal))
     squares = float(np.einsum("ni,nij,nj->", system.residual, system.weight, system.residual))
     variance_factor = squares / max(2 * len(used) - 6, 1)
     relative = symmetric(variance_factor * cov_unit)
@@ -143,9 +146,9 @@ class _Weighted:
         lin = linearize(views, np.zeros(len(model), np.int64), model.points)
         noise = np.square(query.sigma_px[model.keypoint])[:, None, None] * np.eye(2)
         cov = noise + lin.by_point @ model.cov @ np.swapaxes(lin.by_point, 1, 2)
-        in_front = np.isfinite(lin.pixel).all(axis=1)
+        in_front = np.asarray(np.isfinite(lin.pixel).all(axis=1))
         cov[~in_front] = np.eye(2)
-        weight = np.linalg.inv(cov) * in_front[:, None, None]
+        weight = cast(Array, np.linalg.inv(cov) * in_front[:, None, None])
         residual = np.nan_to_num(lin.pixel - query.ideal_px[model.keypoint], nan=1e6)
         return _Weighted(residual, np.nan_to_num(lin.by_pose), np.nan_to_num(lin.by_point), cov, weight)
 

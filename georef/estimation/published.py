@@ -106,7 +106,7 @@ def _model_of_query(
     points = np.array([reconstruction.point3D(p).xyz for p in chosen.values()]).reshape(-1, 3)
     solved = triangulate(views, table[:, 0], table[:, 1], pixel, observations.sigma_px, len(chosen))
     model = LocalModel(np.array(list(chosen), dtype=np.int64), points, solved.cov, views, observations)
-    return model.take(np.isfinite(solved.cov).all(axis=(1, 2)))
+    return model.take(np.asarray(np.isfinite(solved.cov).all(axis=(1, 2))))
 
 
 def _colmap_camera(image: PosedFeatures, camera_id: int) -> pycolmap.Camera:

@@ -105,9 +105,8 @@ def estimate_noise(
 
     Raises StageError where the reference images share too little to say.
     """
-    noise = declared or ReferenceNoise(
-        START_KEYPOINT, (_START_POSITION_M,) * 3, (_START_ROTATION_RAD,) * 3, "estimated"
-    )
+    start = _uniform(_START_POSITION_M), _uniform(_START_ROTATION_RAD)
+    noise = declared or ReferenceNoise(START_KEYPOINT, *start, "estimated")
     limit = config.max_suspect_share * len(images)
     problem, suspects = _problem(images, matches, config, noise)
     suspects = suspects[: int(limit)]
@@ -130,16 +129,21 @@ def estimate_noise(
     )
 
 
+def _uniform(sigma: float) -> tuple[float, float, float]:
+    return sigma, sigma, sigma
+
+
 def _iterated(
     problem: Problem, noise: ReferenceNoise, adjust_config: AdjustConfig, *, estimate_poses: bool
 ) -> tuple[ReferenceNoise, Adjusted]:
     """Adjusts and scales the sigmas by their components until these settle near 1."""
-    for _ in range(_ROUNDS):
-        adjusted = adjust(_with_noise(problem, noise), adjust_config)
-        noise, change = _updated(noise, adjusted, estimate_poses=estimate_poses)
-        problem = _continued(adjusted, noise)
+    adjusted = adjust(_with_noise(problem, noise), adjust_config)
+    noise, change = _updated(noise, adjusted, estimate_poses=estimate_poses)
+    for _ in range(_ROUNDS - 1):
         if change < _SETTLED:
             break
+        adjusted = adjust(_continued(adjusted, noise), adjust_config)
+        noise, change = _updated(noise, adjusted, estimate_poses=estimate_poses)
     return noise, adjusted
 
 
@@ -218,12 +222,12 @@ def _updated(noise: ReferenceNoise, adjusted: Adjusted, *, estimate_poses: bool)
     )
     updated = replace(noise, keypoint_sigma=noise.keypoint_sigma * adjusted.sigma_scale)
     if estimate_poses:
-        updated = replace(updated, position_sigma_m=(new_position,) * 3, rotation_sigma_rad=(new_rotation,) * 3)
+        updated = replace(updated, position_sigma_m=_uniform(new_position), rotation_sigma_rad=_uniform(new_rotation))
     return updated, change
 
 
 def _factor(adjusted: Adjusted, group: str, noise: ReferenceNoise) -> float:
-    """Estimated over stated sigma; 1 where an estimated sigma is so small that the keypoints do not show it any more."""
+    """Estimated over stated sigma; 1 where a sigma is so small already that the keypoints do not show it any more."""
     factor = adjusted.components[group].factor
     if factor is not None:
         return factor

@@ -49,7 +49,7 @@ def position_cov_in_world(world_from_cam: Rigid3, pose_cov: Array) -> Array:
 
 
 def pose_cov_from_parts(world_from_cam: Rigid3, position_cov: Array, rotation_cov_in_cam: Array) -> Array:
-    """Pose covariance (6, 6) of uncorrelated position (3, 3; world axes, m^2) and rotation (3, 3; camera axes, rad^2)."""
+    """Pose covariance (6, 6) of uncorrelated position (3, 3; m^2, world axes) and rotation (3, 3; rad^2, camera)."""
     out = np.zeros((6, 6))
     out[:3, :3] = rotation_cov_in_cam
     out[3:, 3:] = world_from_cam.rotation.T @ position_cov @ world_from_cam.rotation

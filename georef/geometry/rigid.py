@@ -115,7 +115,7 @@ class Rigid3:
     def log(self) -> Array:
         """Tangent vector (6,): rotation rad, translation m."""
         w = log_so3(self.rotation)
-        return np.concatenate([w, np.linalg.solve(_left_jacobian_so3(w), self.translation)])
+        return np.concatenate([w, np.asarray(np.linalg.solve(_left_jacobian_so3(w), self.translation), np.float64)])
 
     def __matmul__(self, other: Rigid3) -> Rigid3:
         """a_from_b @ b_from_c = a_from_c."""
@@ -127,7 +127,7 @@ class Rigid3:
 
     def apply(self, points: ArrayLike) -> Array:
         """Points (..., 3) in b -> points (..., 3) in a."""
-        return np.asarray(points, dtype=np.float64) @ self.rotation.T + self.translation
+        return cast(Array, np.asarray(points, dtype=np.float64) @ self.rotation.T + self.translation)
 
     def retract(self, xi: ArrayLike) -> Rigid3:
         """`self @ Exp(xi)`, the rotation kept orthonormal over many steps."""

@@ -49,21 +49,28 @@ def triangulate(
     Points with fewer than two observations, or behind a camera that sees them, are NaN.
     """
     points = _intersect_rays(views, point, view, pixel, count)
-    weight_plain = 1.0 / np.square(sigma_px)
-    for step in range(_ITERATIONS):
-        lin = linearize(views, view, points[point])
-        residual = lin.pixel - pixel
-        distance = np.linalg.norm(residual, axis=1) / sigma_px
-        weight = weight_plain * np.minimum(1.0, _HUBER / np.maximum(distance, 1e-12))
-        weighted = np.nan_to_num(lin.by_point) * weight[:, None, None]
-        normal = segment_sum(np.einsum("nki,nkj->nij", weighted, np.nan_to_num(lin.by_point)), point, count)
-        if step == _ITERATIONS - 1:
-            break
-        gradient = segment_sum(np.einsum("nki,nk->ni", weighted, np.nan_to_num(residual)), point, count)
+    for _ in range(_ITERATIONS - 1):
+        normal, gradient, _ = _normal_equations(views, point, view, pixel, sigma_px, points)
         points = points - np.einsum("pij,pj->pi", _inverse(normal), gradient)
+    normal, _, residual = _normal_equations(views, point, view, pixel, sigma_px, points)
     bad = np.bincount(point[~np.isfinite(residual).all(axis=1)], minlength=count) > 0
     points[bad | (np.bincount(point, minlength=count) < 2)] = np.nan
     return Triangulated(points, _inverse(normal), residual)
+
+
+def _normal_equations(
+    views: Views, point: NDArray[np.integer], view: NDArray[np.integer], pixel: Array, sigma_px: Array, points: Array
+) -> tuple[Array, Array, Array]:
+    """Normal matrices (P, 3, 3) and gradients (P, 3) with Huber weights, and the residuals (n, 2)."""
+    lin = linearize(views, view, points[point])
+    residual = lin.pixel - pixel
+    distance = np.linalg.norm(residual, axis=1) / sigma_px
+    weight = np.minimum(1.0, _HUBER / np.maximum(distance, 1e-12)) / np.square(sigma_px)
+    by_point = np.nan_to_num(lin.by_point)
+    weighted = by_point * weight[:, None, None]
+    normal = segment_sum(np.einsum("nki,nkj->nij", weighted, by_point), point, len(points))
+    gradient = segment_sum(np.einsum("nki,nk->ni", weighted, np.nan_to_num(residual)), point, len(points))
+    return normal, gradient, residual
 
 
 def _intersect_rays(
@@ -84,6 +91,6 @@ def _inverse(matrices: Array) -> Array:
     scaled = np.nan_to_num(matrices / scale[:, None, None])
     singular = ~(np.abs(np.linalg.det(scaled)) > 1e-12)
     scaled[singular] = np.eye(3)
-    out = np.linalg.inv(scaled) / scale[:, None, None]
+    out: Array = np.linalg.inv(scaled).astype(np.float64) / scale[:, None, None]
     out[singular] = np.nan
     return out

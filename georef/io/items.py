@@ -47,7 +47,7 @@ def write_item(path: Path, header: dict[str, Any], arrays: dict[str, np.ndarray]
 def read_item(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     """Header and arrays of a result. Raises StageError for a file that is missing or damaged."""
     try:
-        with np.load(path, allow_pickle=False) as stored:
+        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as stored:
             arrays = {name: stored[name] for name in stored.files if name != _HEADER}
             return json.loads(stored[_HEADER].tobytes()), arrays
     except (OSError, ValueError, KeyError, zipfile.BadZipFile, EOFError) as error:

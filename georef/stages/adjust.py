@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from georef.estimation.adjustment.adjust import Adjusted, adjust
 from georef.estimation.adjustment.components import Component
@@ -93,7 +94,7 @@ def _blocks(joint: Array, indices: list[int]) -> Array:
     return joint[np.ix_(rows, rows)]
 
 
-def _arrays(adjusted: Adjusted | None, colors: Array) -> dict[str, Array]:
+def _arrays(adjusted: Adjusted | None, colors: NDArray[np.uint8]) -> dict[str, np.ndarray]:
     none = np.zeros((0, 0))
     poses = () if adjusted is None else adjusted.solution.world_from_cams
     return {
@@ -105,7 +106,7 @@ def _arrays(adjusted: Adjusted | None, colors: Array) -> dict[str, Array]:
     }
 
 
-def _colors(problem: Problem, posed: list[PosedFeatures]) -> Array:
+def _colors(problem: Problem, posed: list[PosedFeatures]) -> NDArray[np.uint8]:
     """The colour of each point in one of the images that see it."""
     colors = np.zeros((len(problem.points), 3), np.uint8)
     obs = problem.observations

@@ -9,8 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from georef.cli import app
 from georef.executor import Executor
 from georef.stages.evaluate import evaluate
+from georef.terminal import exit_code
 from tests.stages.bench import Bench
 from tests.worlds.tiny import EPOCH, TinyWorld
 
@@ -126,3 +128,26 @@ def test_poses_are_the_same_with_another_origin(copied: Callable[..., Bench], fi
 def _numbers(poses: bytes) -> np.ndarray:
     rows = [line.split(",") for line in poses.decode().splitlines() if not line.startswith(("#", "image"))]
     return np.array([[float(cell) for cell in row[1:4]] for row in rows])
+
+
+def test_the_command_says_a_line_a_stage_and_where_results_are(
+    copied: Callable[..., Bench], capsys: pytest.CaptureFixture[str]
+) -> None:
+    bench = copied()
+    assert exit_code(app, ["run", str(bench.data), "-o", str(bench.output)]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.split()[0] for line in lines[:5]] == STAGES
+    assert all(line.endswith("[kept]") for line in lines[:5])
+    assert [line.split()[0] for line in lines[5:]] == ["poses.csv", "localization.csv", "report.html", "report.json"]
+    assert all(Path(line.split()[-1]).is_file() for line in lines[5:])
+
+
+def test_the_report_is_rendered_again_from_its_data(
+    copied: Callable[..., Bench], finished: Bench, capsys: pytest.CaptureFixture[str]
+) -> None:
+    bench = copied()
+    page = bench.open().published(EPOCH) / "report.html"
+    page.write_text("spoilt", encoding="utf-8")
+    assert exit_code(app, ["report", str(bench.data), "-o", str(bench.output)]) == 0
+    assert str(page) in capsys.readouterr().out
+    assert page.read_bytes() == finished.published("report.html")

@@ -54,7 +54,7 @@ def test_the_larger_horizontal_sigma_decides() -> None:
 def test_the_box_is_a_square_and_the_nearest_come_first() -> None:
     config = CandidatesConfig(box="published", count=2)
     around = np.array([[9.0, 9.0], [0.5, 0.0], [-9.9, 0.0], [0.0, 10.1], [3.0, -4.0]])
-    positions = np.column_stack([around + [100.0, 50.0], np.zeros(5)])
+    positions = np.column_stack([around + np.array([100.0, 50.0]), np.zeros(5)])
     np.testing.assert_array_equal(search_box(positions, prior(10.0), config).indices, [1, 4, 0, 2])
 
 
@@ -67,7 +67,7 @@ def test_widened_until_there_are_enough_and_says_so() -> None:
 
 
 def test_a_prior_far_from_everything_ends_at_the_whole_reference() -> None:
-    positions = line_of_positions(1.0, 5) + [1e5, 0.0, 0.0]
+    positions = line_of_positions(1.0, 5) + np.array([1e5, 0.0, 0.0])
     box = search_box(positions, prior(1.0), CandidatesConfig(count=10))
     assert sorted(box.indices) == [0, 1, 2, 3, 4]
     assert box.whole_reference
@@ -115,7 +115,7 @@ def test_overlap_counts_points_inside_the_image_from_a_similar_side() -> None:
     world = court(2)
     pose = world.references[0]
     turned = type(pose)(pose.rotation @ exp_so3([0.0, np.pi, 0.0]), pose.translation)
-    behind_the_wall = type(pose)(turned.rotation, pose.translation + [0.0, 40.0, 0.0])
+    behind_the_wall = type(pose)(turned.rotation, pose.translation + np.array([0.0, 40.0, 0.0]))
     views = Views.of([pose, turned, behind_the_wall], [CAMERA] * 3)
     rays = world.points - world.queries[0].translation
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)

@@ -16,7 +16,7 @@ from georef.estimation.adjustment.solve import Solution, solution_views, solve
 from georef.geometry.projection import linearize
 from georef.geometry.rigid import Array
 from georef.types.scene import Observations
-from tests.worlds.blocks import block, control, gnss, orientations, pose_priors, without_gcps
+from tests.worlds.blocks import block, control, gnss, orientations, pose_priors
 from tests.worlds.points import NOISE, scaled_noise
 
 _EXACT = scaled_noise(NOISE, poses=1e-6)
@@ -40,7 +40,7 @@ def hat_traces(problem: Problem, solution: Solution) -> dict[str, float]:
     """tr(A Qxx A' P) of each group, from one dense whitened design matrix of all unknowns."""
     images, points = len(problem.image_ids), len(problem.points)
     size = 6 * images + 3 * points + 3 * len(problem.control)
-    rows: list[tuple[str, Array]] = []
+    rows: list[tuple[str, np.ndarray]] = []
 
     def add(group: str, blocks: dict[int, Array], cov: Array) -> None:
         row = np.zeros((len(cov), size))
@@ -91,22 +91,20 @@ def test_redundancies_are_those_of_the_full_design_matrix_and_add_up() -> None:
 
 @pytest.mark.parametrize("factor", [0.5, 2.0])
 def test_misstated_keypoint_sigma_is_recovered(factor: float) -> None:
-    """Stated sigmas are `factor` times too large: the scale of the adjustment is 1 / factor."""
+    """Stated sigmas are `factor` times the true ones: the scale of the adjustment is 1 / factor."""
     scales, left = [], []
-    for seed in range(6):
-        made, rng = block(seed, noise=_EXACT, points=250), np.random.default_rng([seed, 9])
-        problem = replace(without_gcps(made.problem), pose_priors=pose_priors(made.world, rng))
-        adjusted = adjust(problem.scaled(factor), _CONFIG)
+    for seed in range(4):
+        adjusted = adjust(block(seed, noise=_EXACT, points=250).problem.scaled(factor), _CONFIG)
         scales.append(adjusted.sigma_scale)
         left.append(adjusted.components["image_observations"].factor)
-    assert np.mean(scales) * factor == pytest.approx(1.0, abs=0.05)
-    assert left == pytest.approx([1.0] * 6, abs=0.06)
+    assert np.mean(scales) * factor == pytest.approx(1.0, abs=0.04)
+    assert left == pytest.approx([1.0] * 4, abs=0.06)
 
 
 @pytest.mark.parametrize("factor", [0.5, 2.0])
 def test_misstated_gnss_and_control_sigmas_show_in_their_factors_alone(factor: float) -> None:
     found: dict[str, list[Component]] = {"gnss": [], "control_points": [], "image_observations": []}
-    for seed in range(14):
+    for seed in range(12):
         made, rng = block(seed, noise=_EXACT, points=90), np.random.default_rng([seed, 10])
         priors = gnss(made.world, rng, 0.05)
         problem = replace(
@@ -125,8 +123,8 @@ def test_misstated_gnss_and_control_sigmas_show_in_their_factors_alone(factor: f
         assert pooled.factor_sigma is not None
         assert pooled.factor == pytest.approx(expected, abs=4.0 * pooled.factor_sigma), name
         assert pooled.factor_sigma < 0.12 * expected
-        scatter = np.std([c.factor for c in found[name]])
-        stated = np.mean([c.factor_sigma for c in found[name]])
+        scatter = np.std([c.factor or np.nan for c in found[name]])
+        stated = np.mean([c.factor_sigma or np.nan for c in found[name]])
         assert 0.5 < scatter / stated < 1.7, name
 
 

@@ -56,7 +56,7 @@ def test_results_come_in_order_and_from_other_processes() -> None:
     assert [result[0] for result in here] == [result[0] for result in there] == [item + 10 for item in items]
     assert {result[1] for result in here} == {os.getpid()}
     assert os.getpid() not in {result[1] for result in there}
-    assert len({result[1] for result in there}) == 2
+    assert len({result[1] for result in there}) <= 2
     assert all(result[2] for result in there)
 
 

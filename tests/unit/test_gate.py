@@ -39,7 +39,7 @@ def assert_rate(rejected: int, tested: int, rate: float) -> None:
 def test_priors_are_falsely_rejected_at_the_stated_rate() -> None:
     rejected = {"gnss": 0, "pose_priors": 0, "control_points": 0}
     tested = dict(rejected)
-    for seed in range(40):
+    for seed in range(30):
         made, rng = exact_block(seed)
         problem = replace(
             without_gcps(made.problem),
@@ -60,8 +60,8 @@ def test_priors_are_falsely_rejected_at_the_stated_rate() -> None:
 
 
 def test_errors_that_references_share_are_not_held_against_control_points() -> None:
-    rejected = tested = 0
-    for seed in range(25):
+    rejected = naively = 0
+    for seed in range(15):
         made, rng = block(seed, points=90), np.random.default_rng([seed, 6])
         problem = replace(made.problem, control=control(made.world, rng, count=5, sigma_m=0.003, mark_px=0.3))
         solution = solved(problem)
@@ -69,9 +69,9 @@ def test_errors_that_references_share_are_not_held_against_control_points() -> N
         _, gates = gate_priors(problem, solution, cofactors, posterior, 0.99)
         _, naive = gate_priors(problem, solution, cofactors, cofactors, 0.99)
         rejected += gates["control_points"].rejected
-        tested += naive["control_points"].rejected
-    assert rejected <= 8  # of 125
-    assert tested > 3 * max(rejected, 4)
+        naively += naive["control_points"].rejected
+    assert rejected <= 3  # of 75
+    assert naively >= 5
 
 
 @pytest.mark.parametrize("stated", [0.5, 1.0, 2.0])
@@ -161,7 +161,9 @@ def test_the_worst_orientation_is_the_wrong_one() -> None:
         given = orientations(made.world, rng, 0.01, 3e-4)
         for shift in (0.0, 0.15):
             pose = given[2].world_from_cam
-            wrong = replace(given[2], world_from_cam=Rigid3(pose.rotation, pose.translation + [0.0, shift, 0.0]))
+            wrong = replace(
+                given[2], world_from_cam=Rigid3(pose.rotation, pose.translation + np.array([0.0, shift, 0.0]))
+            )
             problem = replace(without_gcps(made.problem), orientations={**given, 2: wrong})
             solution = solved(problem)
             found.append(worst_orientation(problem, solution, posteriors(problem, solution)[0], 0.9999))

@@ -49,8 +49,10 @@ def test_band_is_symmetric_and_in_keypoint_scales() -> None:
     pairs = common(a, b).indices
     assert band[pairs[:, 0], pairs[:, 1]].mean() > 0.97  # noise of 0.4 scales a coordinate in each image
     assert band.mean() < 0.05
-    coarse = [replace(s.features, scales_px=10.0 * s.features.scales_px) for s in (a, b)]
-    wide = epipolar_band(*(replace(s.posed(), features=f) for s, f in zip((a, b), coarse, strict=True)), 0.3)
+    coarse_a, coarse_b = (
+        replace(s.posed(), features=replace(s.features, scales_px=10.0 * s.features.scales_px)) for s in (a, b)
+    )
+    wide = epipolar_band(coarse_a, coarse_b, 0.3)
     np.testing.assert_array_equal(wide, band)
 
 

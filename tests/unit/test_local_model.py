@@ -1,4 +1,4 @@
-"""The local model: exact without noise, covariances against Monte Carlo, inconsistent and weak observations left out."""
+"""The local model: exact without noise, covariances against Monte Carlo, what is inconsistent or weak left out."""
 
 from __future__ import annotations
 
@@ -89,7 +89,7 @@ def test_points_of_unknown_depth_are_left_out() -> None:
     """Two cameras 2 cm apart see the points, but not how far they are."""
     world = court(5)
     first = world.references[0]
-    beside = Rigid3(first.rotation, first.translation + [0.02, 0.0, 0.0])
+    beside = Rigid3(first.rotation, first.translation + np.array([0.02, 0.0, 0.0]))
     narrow = replace(world, references=(first, beside))
     query, references = photographs(narrow, 5)
     assert len(common(query, references[0])) > 30
@@ -133,3 +133,7 @@ def test_larger_reference_errors_lose_observations_but_give_no_wrong_ones() -> N
     pixel = model.views.project(model.observations.view, model.points[model.observations.point])
     distance = np.linalg.norm(pixel - model.observations.pixel, axis=1) / model.observations.sigma_px
     assert distance.max() <= 3.5 + 1e-9
+
+
+def test_no_references_no_points() -> None:
+    assert len(query_centred_model([], [], _SIGMA)) == 0

@@ -109,13 +109,14 @@ def pose_priors(world: World, rng: np.random.Generator, bad: Collection[int] = (
     for i, truth in enumerate(world.queries):
         cov = loose_cov(truth, 0.02, 0.001)
         pose = truth.retract(np.linalg.cholesky(cov) @ rng.normal(size=6))
-        out[i] = PosePrior(Rigid3(pose.rotation, pose.translation + [off_m * (i in bad), 0.0, 0.0]), cov)
+        shift = np.array([off_m * (i in bad), 0.0, 0.0])
+        out[i] = PosePrior(Rigid3(pose.rotation, pose.translation + shift), cov)
     return out
 
 
 def orientations(world: World, rng: np.random.Generator, sigma_m: float, sigma_rad: float) -> dict[int, Orientation]:
     """Given exterior orientations of all new images."""
-    noise = ReferenceNoise(1.0, (sigma_m,) * 3, (sigma_rad,) * 3, "declared")
+    noise = ReferenceNoise(1.0, (sigma_m, sigma_m, sigma_m), (sigma_rad, sigma_rad, sigma_rad), "declared")
     return {
         i: Orientation(disturbed(pose, noise, rng), np.full(3, sigma_m), np.full(3, sigma_rad))
         for i, pose in enumerate(world.queries)

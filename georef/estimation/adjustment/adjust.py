@@ -11,7 +11,7 @@ from georef.estimation.adjustment.posterior import Posterior, posteriors
 from georef.estimation.adjustment.problem import Problem
 from georef.estimation.adjustment.solve import Solution, solve
 
-_GATE_ROUNDS, _ROBUST_ROUNDS = 3, 3
+_GATE_ROUNDS, _ROBUST_ROUNDS = 3, 2
 _FAR_OFF = 1.25  # of a sigma against its residuals
 _SETTLED_SHARE = 1e-4  # of the observations: a gate that drops fewer changes nothing
 _FACTOR_TOLERANCE = 0.05
@@ -59,13 +59,13 @@ def adjust(problem: Problem, config: AdjustConfig) -> Adjusted:
 def _robust(problem: Problem, config: AdjustConfig) -> tuple[Problem, Solution, float]:
     """The robust solution, with image sigmas near what the residuals show: a loss far too narrow fits too few."""
     scale = 1.0
+    solution = solve(problem, cauchy_scale=config.cauchy_scale, max_iterations=config.max_iterations)
     for _ in range(_ROBUST_ROUNDS):
-        solution = solve(problem, cauchy_scale=config.cauchy_scale, max_iterations=config.max_iterations)
-        factor = residual_scale(problem, solution)
+        factor = min(max(residual_scale(problem, solution), 0.1), 10.0)
         if 1.0 / _FAR_OFF < factor < _FAR_OFF:
             break
-        factor = min(max(factor, 0.1), 10.0)
         problem, scale = problem.scaled(factor).with_poses(solution.world_from_cams, solution.points), scale * factor
+        solution = solve(problem, cauchy_scale=config.cauchy_scale, max_iterations=config.max_iterations)
     return problem, solution, scale
 
 

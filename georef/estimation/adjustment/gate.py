@@ -82,7 +82,7 @@ class _Tested:
         normal = normal + problem.gcps.information(count)
         singular = np.linalg.cond(normal) > 1e12
         normal[singular] = np.eye(3)
-        inverse = np.linalg.inv(normal)
+        inverse: Array = np.linalg.inv(normal).astype(np.float64)
         statistic, rank = _statistic(residual, np.eye(2) - by_point @ inverse[obs.point] @ np.swapaxes(by_point, 1, 2))
         checked = (rank > 0) & ~behind
         scale2 = float(np.median(statistic[checked] / _MEDIAN[rank[checked]])) if checked.any() else 1.0

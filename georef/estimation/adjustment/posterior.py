@@ -7,8 +7,10 @@ Agrees with gtsam.Marginals, which recovers the covariance of one variable at a 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any, cast
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 from scipy.sparse import bsr_array, coo_array, csr_array
 
@@ -52,7 +54,7 @@ def posteriors(problem: Problem, solution: Solution) -> tuple[Posterior, Posteri
     control = control_observations(problem)
     information = problem.gcps.information(len(problem.points))
     tie = _eliminate(problem, solution, problem.observations, solution.points, information)
-    weights = np.array([np.linalg.inv(point.cov) for point in problem.control]).reshape(-1, 3, 3)
+    weights = np.array([np.linalg.inv(point.cov) for point in problem.control], dtype=np.float64).reshape(-1, 3, 3)
     marked = _eliminate(problem, solution, control, solution.control_points, weights)
     cofactors = _inverse(_prior_information(problem, solution) + tie.reduced + marked.reduced, problem.image_ids)
     cov = cofactors + _shared_reference_part(problem, tie, cofactors)
@@ -106,11 +108,11 @@ def _eliminate(
     point_blocks = segment_sum(np.swapaxes(by_point, 1, 2) @ by_point * weight, obs.point, count) + point_information
     unseen = np.linalg.det(point_blocks) <= 0
     point_blocks[unseen] = np.eye(3)
-    inverse = np.linalg.inv(point_blocks)
+    inverse = cast(Array, np.linalg.inv(point_blocks))
     mixed = _block_matrix(np.swapaxes(by_pose, 1, 2) @ by_point * weight, obs.view, obs.point, images, count)
     right = bsr_array((inverse, np.arange(count), np.arange(count + 1)), shape=(3 * count, 3 * count))
     solved = csr_array(right @ mixed.T)
-    reduced = _block_diagonal(pose_blocks) - (mixed @ solved).toarray()
+    reduced = _block_diagonal(pose_blocks) - _dense(mixed @ solved)
     return _Eliminated(reduced, inverse, solved)
 
 
@@ -126,16 +128,23 @@ def _shared_reference_part(problem: Problem, tie: _Eliminated, cov: Array) -> Ar
     points = gcps.point[gcps.ray_gcp]
     shape = (len(problem.points), len(gcps.reference_ids))
     moved = _block_matrix(np.swapaxes(weighted, 1, 2), gcps.ray_reference, points, shape[1], shape[0])
-    gain = cov @ (moved @ tie.solved).toarray().T
+    gain = cov @ _dense(moved @ tie.solved).T
     blocks = gain.reshape(len(cov), shape[1], 6)
     return symmetric(np.einsum("irk,rkl,jrl->ij", blocks, gcps.reference_covs, blocks, optimize=True))
 
 
-def _block_matrix(blocks: Array, row: Array, column: Array, rows: int, columns: int):
+def _block_matrix(
+    blocks: Array, row: NDArray[np.int64], column: NDArray[np.int64], rows: int, columns: int
+) -> csr_array:
     """Sparse (6 rows, 3 columns) of (n, 6, 3) blocks."""
     i = (6 * row)[:, None, None] + np.arange(6)[None, :, None] + np.zeros((1, 1, 3), int)
     j = (3 * column)[:, None, None] + np.arange(3)[None, None, :] + np.zeros((1, 6, 1), int)
-    return coo_array((blocks.ravel(), (i.ravel(), j.ravel())), shape=(6 * rows, 3 * columns)).tocsr()
+    return csr_array(coo_array((blocks.ravel(), (i.ravel(), j.ravel())), shape=(6 * rows, 3 * columns)))
+
+
+def _dense(matrix: Any) -> Array:
+    """The dense form of a sparse product, whose type scipy's annotations do not know."""
+    return matrix.toarray()
 
 
 def _block_diagonal(blocks: Array) -> Array:
