@@ -27,6 +27,7 @@ class LightGlueAliked:
     """
 
     name = "lightglue-aliked"
+    extractors = ("aliked-n16",)  # whose descriptors the weights are made for
     weights = "aliked_lightglue"
 
     def __init__(

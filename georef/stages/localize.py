@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from georef.config import Config
-from georef.errors import StageError
+from georef.errors import ConfigError, StageError
 from georef.estimation.localization import localize_image
 from georef.estimation.reference_map import ReferenceMap
 from georef.features.base import Matcher
@@ -127,4 +127,12 @@ def components(config: Config, stage: str) -> str:
     """What else than configuration and inputs decides the result: the matcher's version, for this stage alone."""
     if stage != "localize":
         return ""
-    return load_component(MATCHERS, config.matching.matcher, **config.matching.options).version()
+    matcher = load_component(MATCHERS, config.matching.matcher, **config.matching.options)
+    fitting = getattr(matcher, "extractors", None)  # None: any
+    if fitting is not None and config.features.extractor not in fitting:
+        raise ConfigError(
+            f"The matcher '{config.matching.matcher}' cannot match features of '{config.features.extractor}'.",
+            f"Expected features.extractor to be {' or '.join(fitting)}.",
+            "Choose another with --set matching.matcher=mutual-nn, or a preset such as sift.",
+        )
+    return matcher.version()
