@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from georef.config import Config
 from georef.executor import Executor
 from georef.io.files import write_text_atomically
 from georef.project import Project
@@ -32,7 +33,7 @@ class Stage:
 
     name: str
     version: int  # raise it when the same inputs give other results
-    sections: tuple[str, ...]  # of the configuration
+    sections: tuple[str, ...]  # of the configuration, or section.key
     reads: Callable[[Project, Survey], dict[str, Any]]
     needs: tuple[str, ...]  # stages before it
     run: Run
@@ -63,9 +64,19 @@ def _check(project: Project, survey: Survey) -> dict[str, Any]:
     return {"check points": _hash([_plain(p) for p in survey.check]), **_reference_files(project, survey)}
 
 
+_NETWORK_KEYS = (
+    "network",
+    "localize.guided_gate",
+    "localize.guided_min_similarity",
+    "localize.guided_ratio",
+    "adjust.cauchy_scale",
+    "adjust.gate_probability",
+    "adjust.max_iterations",
+)
+
 STAGES: tuple[Stage, ...] = (
     Stage("features", 1, ("features",), _all_images, (), features.run),
-    Stage("network", 1, ("network", "localize", "adjust"), _reference_files, ("features",), network.run),
+    Stage("network", 1, _NETWORK_KEYS, _reference_files, ("features",), network.run),
     Stage("localize", 2, ("matching", "candidates", "localize"), _epoch_files, ("features", "network"), localize.run),
     Stage("adjust", 2, ("adjust", "localize"), _control, ("features", "network", "localize"), adjust.run),
     Stage("report", 1, ("report",), _check, ("features", "network", "localize", "adjust"), report.run),
@@ -119,7 +130,7 @@ def _plan(
         parts = {
             "stage version": stage.version,
             "components": version if stage.name == "features" else localize.components(project.config, stage.name),
-            **{f"[{name}]": getattr(project.config, name).model_dump() for name in stage.sections},
+            **{f"[{name}]": _setting(project.config, name) for name in stage.sections},
             **stage.reads(project, survey),
             **{f"stage {name}": prints[name] for name in stage.needs},
         }
@@ -173,6 +184,13 @@ def _state_of(project: Project, epoch: str, stage: Stage, folder: Path, parts: d
     now = json.loads(json.dumps(parts))  # as it is stored: a tuple is a list there
     changed = [key for key in {**before, **now} if before.get(key) != now.get(key)]
     return StageState(stage.name, "stale", f"changed: {', '.join(changed)}", folder)
+
+
+def _setting(config: Config, name: str) -> Any:
+    """A section of the configuration as plain values, or one key of it."""
+    section, _, key = name.partition(".")
+    values = getattr(config, section).model_dump()
+    return values[key] if key else values
 
 
 def _digest(campaign: Campaign) -> str:

@@ -80,7 +80,7 @@ def test_a_changed_setting_makes_stale_what_depends_on_it(copied: Callable[..., 
         "adjust": "stale",
         "report": "stale",
     }
-    assert states["network"].why == "changed: [adjust]"
+    assert states["network"].why == "changed: [adjust.cauchy_scale]"
     assert states["localize"].why == "changed: stage network"
     states = bench.states("report.recording_max_points=10")
     assert [name for name, s in states.items() if s.state != "done"] == ["report"]
