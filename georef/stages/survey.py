@@ -58,11 +58,6 @@ def table_format(section: TableSection) -> TableFormat:
     return TableFormat(section.delimiter, section.decimal, section.encoding)
 
 
-def world_pose(world: WorldFrame, position_in_crs: Array, axes_from_cam: Array) -> Rigid3:
-    """world_from_cam of a position and rotation that refer to the CRS and its axes at that position."""
-    return world_poses(world, position_in_crs[None], axes_from_cam[None])[0]
-
-
 def world_poses(world: WorldFrame, positions_in_crs: Array, axes_from_cam: Array) -> list[Rigid3]:
     """world_from_cam of positions (N, 3) and rotations (N, 3, 3)."""
     centres = world.world_from_crs(positions_in_crs)
