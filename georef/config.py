@@ -69,6 +69,8 @@ class AdjustConfig(Section):
     gnss: bool = True
     surveyed_control: bool = False
     max_gcps_per_image: int = Field(default=1500, ge=20)
+    tie_neighbours: int = Field(default=8, ge=1)
+    min_tie_point_rays: int = Field(default=3, ge=2)
     max_tie_points_per_image: int = Field(default=100, ge=20)
     cauchy_scale: float = Field(default=2.0, gt=0)
     gate_probability: float = Field(default=0.999, gt=0.5, lt=1)

@@ -76,9 +76,9 @@ _NETWORK_KEYS = (
 
 STAGES: tuple[Stage, ...] = (
     Stage("features", 1, ("features",), _all_images, (), features.run),
-    Stage("network", 1, _NETWORK_KEYS, _reference_files, ("features",), network.run),
+    Stage("network", 2, _NETWORK_KEYS, _reference_files, ("features",), network.run),
     Stage("localize", 2, ("matching", "candidates", "localize"), _epoch_files, ("features", "network"), localize.run),
-    Stage("adjust", 2, ("adjust", "localize"), _control, ("features", "network", "localize"), adjust.run),
+    Stage("adjust", 3, ("adjust", "localize", "matching"), _control, ("features", "network", "localize"), adjust.run),
     Stage("report", 1, ("report",), _check, ("features", "network", "localize", "adjust"), report.run),
 )
 

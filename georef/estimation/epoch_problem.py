@@ -4,62 +4,86 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from itertools import combinations
 
 import numpy as np
+from numpy.typing import NDArray
 
-from georef.config import AdjustConfig, LocalizeConfig
+from georef.config import AdjustConfig
 from georef.errors import StageError
 from georef.estimation.adjustment.problem import AutomaticGcps, Problem
 from georef.estimation.candidates import overlap
-from georef.estimation.guided import GuidedOptions, PosedFeatures, guided_matches
+from georef.estimation.guided import PosedFeatures, epipolar_band
 from georef.estimation.local_model import triangulate_consistent
 from georef.estimation.reference_map import ReferenceMap
 from georef.estimation.tracks import (
     PairMatches,
     build_tracks,
     distributed,
+    nearest_ray_angles,
+    quantized,
     select_points,
     triangulated_tracks,
 )
 from georef.executor import Progress
+from georef.features.base import Matcher
 from georef.geometry.projection import Views, linearize
+from georef.geometry.rigid import Array
 from georef.types.campaign import Image, PosePrior
 from georef.types.constraints import ControlPoint
-from georef.types.results import Localized
+from georef.types.results import Localized, ReferenceNoise
 from georef.types.scene import Observations
 
 _LEAST_PAIR_MATCHES = 15
 _GCP_GATE_SIGMAS = 3.5
 
 
+def tie_pairs(
+    images: Sequence[PosedFeatures], localized: Sequence[Localized], neighbours: int
+) -> list[tuple[int, int]]:
+    """The pairs of new images to match: each with those that see most of the points it was localized from."""
+    seen = np.zeros((len(images), len(images)), np.int64)
+    for i, result in enumerate(localized):
+        seen[i] = _seen_by(images, result)
+        seen[i, i] = 0
+    shared = np.maximum(seen, seen.T)
+    return sorted(
+        {
+            (min(i, int(j)), max(i, int(j)))
+            for i in range(len(images))
+            for j in np.argsort(-shared[i], kind="stable")[:neighbours]
+            if shared[i, j] > 0
+        }
+    )
+
+
+def _seen_by(images: Sequence[PosedFeatures], result: Localized) -> NDArray[np.int64]:
+    directions = result.points_in_world - result.world_from_cam.translation
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    views = Views.of([image.world_from_cam for image in images], [image.camera for image in images])
+    sizes = np.array([[image.camera.width, image.camera.height] for image in images], dtype=float)
+    return overlap(result.points_in_world, directions, views, sizes)
+
+
 def match_new_images(
     images: Sequence[PosedFeatures],
-    localized: Sequence[Localized],
-    config: LocalizeConfig,
+    pairs: Sequence[tuple[int, int]],
+    matcher: Matcher,
+    keypoints: int,
+    gate: float,
     progress: Progress,
 ) -> list[PairMatches]:
-    """Guided matches of all pairs of new images that can see common points of their localization."""
-    options = GuidedOptions(config.guided_gate, config.guided_min_similarity, config.guided_ratio)
+    """Matches of pairs of new images, the strongest keypoints of each, that lie in the epipolar band of their poses."""
     out = []
-    progress.begin("tie points", len(images) * (len(images) - 1) // 2)
-    for i, j in combinations(range(len(images)), 2):
-        if _sees(images[j], localized[i]) or _sees(images[i], localized[j]):
-            matches = guided_matches(images[i], images[j], options)
-            if len(matches) >= _LEAST_PAIR_MATCHES:
-                out.append(PairMatches(i, j, matches.indices))
+    progress.begin("tie points", len(pairs))
+    for i, j in pairs:
+        a, b = images[i], images[j]
+        found = matcher.match(a.features.head(keypoints), b.features.head(keypoints)).indices
+        found = found[epipolar_band(a, b, gate)[found[:, 0], found[:, 1]]]
+        if len(found) >= _LEAST_PAIR_MATCHES:
+            out.append(PairMatches(i, j, found))
         progress.advance()
     progress.end()
     return out
-
-
-def _sees(image: PosedFeatures, other: Localized) -> bool:
-    """Whether an image can see points that another was localized from, from a similar side."""
-    directions = other.points_in_world - other.world_from_cam.translation
-    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    views = Views.of([image.world_from_cam], [image.camera])
-    size = np.array([[image.camera.width, image.camera.height]], dtype=float)
-    return bool(overlap(other.points_in_world, directions, views, size)[0] > 0)
 
 
 def epoch_problem(
@@ -79,7 +103,7 @@ def epoch_problem(
         posed += [reference.posed(i) for i in used]
         covs += [reference.pose_cov(i) for i in used]
         matches += to_references
-    points, observations = _points(posed, matches, covs, reference.noise.keypoint_sigma, len(new), config)
+    points, observations = _points(posed, matches, covs, reference.noise, len(new), config)
     in_new = observations.view < len(new)
     problem = Problem(
         image_ids=tuple(r.image_id for r in localized),
@@ -95,12 +119,21 @@ def epoch_problem(
     return problem.restricted(np.ones(len(problem.observations), bool), np.ones(len(problem.gcps), bool))
 
 
-def _points(posed, matches, covs, keypoint_sigma, new_count, config):
+def _points(
+    posed: Sequence[PosedFeatures],
+    matches: Sequence[PairMatches],
+    covs: Sequence[Array],
+    noise: ReferenceNoise,
+    new_count: int,
+    config: AdjustConfig,
+) -> tuple[Array, Observations]:
     """Tracks, triangulated, thinned to the budget of the new images."""
-    count, observations = build_tracks(posed, matches, keypoint_sigma)
+    count, observations = build_tracks(posed, matches, noise.keypoint_sigma)
     if count == 0:
         return np.zeros((0, 3)), observations
     points, observations = triangulated_tracks(count, observations, posed, covs)
+    angle = nearest_ray_angles(points, observations, np.array([p.world_from_cam.translation for p in posed]))
+    observations = replace(observations, sigma_px=quantized(observations.sigma_px * noise.widening(angle)))
     sizes = np.array([[p.camera.width, p.camera.height] for p in posed], dtype=float)
     is_new = np.arange(len(posed)) < new_count
     in_new = np.bincount(observations.point[observations.view < new_count], minlength=len(points))
@@ -108,7 +141,7 @@ def _points(posed, matches, covs, keypoint_sigma, new_count, config):
     keep = np.zeros(len(points), bool)
     for kind, budget in (
         (gcp & (in_new >= 1), config.max_gcps_per_image),
-        (~gcp & (in_new >= 2), config.max_tie_points_per_image),
+        (~gcp & (in_new >= config.min_tie_point_rays), config.max_tie_points_per_image),
     ):
         chosen = distributed(observations.take(kind[observations.point]), sizes, is_new, budget)
         keep[: len(chosen)] |= chosen

@@ -17,14 +17,23 @@ from georef.config import AdjustConfig, NetworkConfig
 from georef.errors import StageError
 from georef.estimation.adjustment.adjust import Adjusted, adjust
 from georef.estimation.adjustment.components import Component
-from georef.estimation.adjustment.gate import worst_orientation
+from georef.estimation.adjustment.gate import variance_ratios, worst_orientation
 from georef.estimation.adjustment.posterior import posterior
 from georef.estimation.adjustment.problem import Orientation, Problem
+from georef.estimation.adjustment.solve import Solution, solution_views
 from georef.estimation.guided import GuidedOptions, PosedFeatures, epipolar_band, guided_matches
-from georef.estimation.tracks import PairMatches, build_tracks, distributed, select_points, triangulated_tracks
+from georef.estimation.tracks import (
+    PairMatches,
+    build_tracks,
+    distributed,
+    nearest_ray_angles,
+    select_points,
+    triangulated_tracks,
+)
 from georef.executor import Progress
 from georef.features.nearest import MutualNearest
 from georef.geometry.rigid import Array
+from georef.geometry.triangulation import triangulate
 from georef.types.results import ReferenceNoise
 
 _VOTERS = 512
@@ -32,6 +41,8 @@ _START_POSITION_M, _START_ROTATION_RAD, START_KEYPOINT = 0.01, 3e-4, 0.5
 _LEAST_POSITION_M, _LEAST_ROTATION_RAD = 1e-4, 1e-6
 _ROUNDS, _SETTLED = 10, 0.03
 _LEAST_POINTS = 30
+_ANGLE_EDGES, _LEAST_ANGLE_BINS = np.radians([5.0, 10.0, 15.0, 20.0, 30.0, 45.0, 60.0]), 3
+_LEAST_WIDENING_RAD, _WIDENING_ROUNDS = np.radians(3.0), 5
 _LOOSE = 5.0  # times the sigmas of poses, for the gate of the tracks
 _LEAST_MATCHED, _CONTRADICTED = 20, 0.5  # observations of an image; its share of them that is used against the usual
 
@@ -120,13 +131,48 @@ def estimate_noise(
         suspects.append(worst)
         problem = _set_aside(_continued(adjusted, noise), [worst])
     return NetworkResult(
-        noise,
+        replace(noise, widening_angle_rad=widening_angle(adjusted.problem, adjusted.solution)),
         adjusted.components,
         tuple(suspects),
         len(images),
         len(adjusted.problem.points),
         len(adjusted.problem.observations),
     )
+
+
+def widening_angle(problem: Problem, solution: Solution) -> float:
+    """How the variance of keypoints grows with the angle they are matched across: that of `ReferenceNoise.widening`.
+
+    Residuals show it undiluted only where the points were intersected with the right weights: so it is iterated, poses
+    held. Infinite where the network shows no growth.
+    """
+    obs, views = problem.observations, solution_views(problem, solution)
+    angle = nearest_ray_angles(solution.points, obs, views.centres)
+    widening = np.ones(len(obs))
+    found = np.inf
+    for _ in range(_WIDENING_ROUNDS):
+        weighted = replace(problem, observations=replace(obs, sigma_px=obs.sigma_px * widening))
+        sigma = weighted.observations.sigma_px
+        points = triangulate(views, obs.point, obs.view, obs.pixel, sigma, len(solution.points)).points
+        ratio = variance_ratios(weighted, replace(solution, points=points)) * np.square(widening)
+        found = _growth(angle, ratio)
+        widening = np.sqrt(1.0 + angle / found)
+    return found
+
+
+def _growth(angle: Array, variance: Array) -> float:
+    """The angle across which a variance doubles, from a straight line through the medians of angle bins."""
+    known = np.isfinite(variance) & np.isfinite(angle)
+    angle, variance = angle[known], variance[known]
+    index = np.searchsorted(_ANGLE_EDGES, angle)
+    bins = [index == i for i in range(len(_ANGLE_EDGES) + 1) if (index == i).sum() >= _LEAST_POINTS]
+    if len(bins) < _LEAST_ANGLE_BINS:
+        return np.inf
+    middle = np.array([np.median(angle[part]) for part in bins])
+    level = np.array([np.median(variance[part]) for part in bins])
+    count = np.array([part.sum() for part in bins])
+    slope, start = np.polyfit(middle, level, 1, w=np.sqrt(count) / level)
+    return float(max(start / slope, _LEAST_WIDENING_RAD)) if slope > 0 else np.inf
 
 
 def _uniform(sigma: float) -> tuple[float, float, float]:

@@ -96,6 +96,26 @@ def distributed(observations: Observations, sizes: Array, limited: NDArray[np.bo
     return keep
 
 
+def nearest_ray_angles(points: Array, observations: Observations, centres: Array) -> Array:
+    """The angle (n,), in radians, between the ray of each observation and the nearest other ray of its point.
+
+    points: (P, 3); centres: (V, 3) of the views. Infinite where a point has no other ray.
+    """
+    order = np.argsort(observations.point, kind="stable")
+    point = observations.point[order]
+    ray = points[point] - centres[observations.view[order]]
+    ray /= np.linalg.norm(ray, axis=1, keepdims=True)
+    chord = np.full(len(point), np.inf)
+    for step in range(1, int(np.bincount(point).max(initial=1))):
+        first = np.flatnonzero(point[step:] == point[:-step])
+        apart = np.linalg.norm(ray[first + step] - ray[first], axis=1)
+        chord[first] = np.minimum(chord[first], apart)
+        chord[first + step] = np.minimum(chord[first + step], apart)
+    angle = np.full(len(point), np.inf)
+    angle[order] = np.where(np.isfinite(chord), 2.0 * np.arcsin(np.minimum(chord, 2.0) / 2.0), np.inf)
+    return angle
+
+
 def select_points(points: Array, observations: Observations, keep: NDArray[np.bool_]) -> tuple[Array, Observations]:
     """The points to keep with their observations, renumbered."""
     kept = observations.take(keep[observations.point])

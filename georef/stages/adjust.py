@@ -13,7 +13,7 @@ from georef.estimation.adjustment.adjust import Adjusted, adjust
 from georef.estimation.adjustment.components import Component
 from georef.estimation.adjustment.problem import Problem, control_observations
 from georef.estimation.adjustment.solve import solution_views
-from georef.estimation.epoch_problem import epoch_problem, match_new_images
+from georef.estimation.epoch_problem import epoch_problem, match_new_images, tie_pairs
 from georef.estimation.guided import PosedFeatures
 from georef.geometry.rigid import Array, Rigid3
 from georef.io.items import read_item, write_item
@@ -61,12 +61,13 @@ def run(context: StageContext) -> StageSummary:
         PosedFeatures.of(store.read(feature_id(image)), image.camera, o.world_from_cam)
         for image, o in zip(images, localized, strict=True)
     ]
-    ties = (
-        match_new_images(posed, localized, config.localize, context.executor.progress)
-        if config.adjust.tie_points
-        else []
-    )
-    reference = make_task(context).map
+    task = make_task(context)
+    reference = task.map
+    ties = []
+    if config.adjust.tie_points:
+        pairs = tie_pairs(posed, localized, config.adjust.tie_neighbours)
+        keypoints, gate = config.matching.max_keypoints, config.localize.guided_gate
+        ties = match_new_images(posed, pairs, task.matcher, keypoints, gate, context.executor.progress)
     problem = epoch_problem(images, localized, posed, ties, reference, context.survey.control, config.adjust)
     adjusted = adjust(problem, config.adjust)
     data = _data(problem, adjusted)

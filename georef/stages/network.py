@@ -66,6 +66,7 @@ def read_noise(folder: Path) -> tuple[ReferenceNoise, tuple[str, ...]]:
         position_sigma_m=tuple(data["position_sigma_m"]),
         rotation_sigma_rad=tuple(data["rotation_sigma_rad"]),
         source=data["source"],
+        widening_angle_rad=np.inf if data["widening_angle_rad"] is None else data["widening_angle_rad"],
     )
     return noise, tuple(data["suspects"])
 
@@ -107,6 +108,7 @@ def _as_data(result: NetworkResult, suspects: list[str]) -> dict:
         "keypoint_sigma": noise.keypoint_sigma,
         "position_sigma_m": list(noise.position_sigma_m),
         "rotation_sigma_rad": list(noise.rotation_sigma_rad),
+        "widening_angle_rad": noise.widening_angle_rad if np.isfinite(noise.widening_angle_rad) else None,
         "suspects": suspects,
         "images": result.images,
         "points": result.points,

@@ -73,6 +73,14 @@ class ReferenceNoise:
     position_sigma_m: tuple[float, float, float]  # of a reference position, east, north, up
     rotation_sigma_rad: tuple[float, float, float]  # about the camera axes
     source: str  # "declared" or "estimated"
+    widening_angle_rad: float = np.inf  # a match across it has twice the variance of one across no angle
+
+    def widening(self, angle_rad: Array) -> Array:
+        """Factors (n,) on the sigmas of keypoints that were matched across angles (n,) between their rays.
+
+        Seen from another side, a keypoint sits on a slightly different spot of the same thing.
+        """
+        return np.sqrt(1.0 + angle_rad / self.widening_angle_rad)
 
     def pose_cov(self, world_from_cam: Rigid3) -> Array:
         """Covariance (6, 6) of a reference pose."""

@@ -122,8 +122,9 @@ def test_a_reader_that_goes_away_is_no_fault(tiny_tables: Path) -> None:
 
 
 def test_an_interrupted_run_says_how_to_go_on(tiny_tables: Path) -> None:
-    code = (
-        "import time, georef.project as p; p.open_project = lambda *a, **k: print('here', flush=True) or time.sleep(60)"
+    code = (  # a shell ignores the interrupt on behalf of what it starts in the background, and children inherit that
+        "import signal, time, georef.project as p; signal.signal(signal.SIGINT, signal.default_int_handler); "
+        "p.open_project = lambda *a, **k: print('here', flush=True) or time.sleep(60)"
     )
     command = [sys.executable, "-c", f"{code}\nfrom georef.cli import main; main()", "status", str(tiny_tables)]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)

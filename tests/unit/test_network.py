@@ -11,13 +11,25 @@ import pytest
 
 from georef.config import AdjustConfig, NetworkConfig
 from georef.errors import StageError
+from georef.estimation.adjustment.problem import Problem
+from georef.estimation.adjustment.solve import Solution
 from georef.estimation.guided import GuidedOptions, PosedFeatures
-from georef.estimation.reference_network import NetworkResult, choose_images, estimate_noise, match_network
-from georef.estimation.tracks import PairMatches
+from georef.estimation.reference_network import (
+    NetworkResult,
+    choose_images,
+    estimate_noise,
+    match_network,
+    widening_angle,
+)
+from georef.estimation.tracks import PairMatches, nearest_ray_angles
 from georef.executor import Silent
+from georef.geometry.angles import rotation_from_yaw_pitch_roll
+from georef.geometry.projection import Views
 from georef.geometry.rigid import Rigid3
+from georef.geometry.triangulation import triangulate
 from georef.types.results import ReferenceNoise
-from tests.worlds.points import NOISE, Seen, common, court, disturbed, photograph, scaled_noise
+from georef.types.scene import Observations
+from tests.worlds.points import CAMERA, NOISE, Seen, common, court, disturbed, photograph, scaled_noise
 
 _NETWORK = NetworkConfig(max_points_per_image=100)
 _ADJUST = AdjustConfig()
@@ -144,3 +156,41 @@ def test_chosen_images_lie_together() -> None:
     assert np.ptp(positions[shuffled][chosen, 0]) <= 11
     assert (np.diff(chosen) > 0).all()
     np.testing.assert_array_equal(choose_images(positions[:5], 11), np.arange(5))
+
+
+def around(rng: np.random.Generator, widening_rad: float, count: int = 3000) -> tuple[Problem, Solution]:
+    """Points seen by two to four of the cameras on an arc about them, noise growing with the angle between rays."""
+    yaw = np.radians(np.sort(rng.uniform(-70, 70, 40)))
+    poses = []
+    for angle in yaw:
+        rotation = rotation_from_yaw_pitch_roll([angle, 0.0, 0.0])
+        poses.append(Rigid3(rotation, -20.0 * rotation[:, 2]))
+    centres = np.array([pose.translation for pose in poses])
+    points = rng.uniform(-2, 2, (count, 3))
+    rays = rng.integers(2, 5, count)
+    first = rng.integers(0, 40, count)
+    seen_by = [(f + rng.permutation(14)[:n]) % 40 for f, n in zip(first, rays, strict=True)]
+    view = np.concatenate(seen_by)
+    point = np.repeat(np.arange(count), rays)
+    views = Views.of(poses, [CAMERA] * 40)
+    exact = Observations(
+        point, view, views.project(view, points[point]), np.full(len(point), 0.5), np.arange(len(point))
+    )
+    wide = ReferenceNoise(1.0, (1.0, 1.0, 1.0), (1.0, 1.0, 1.0), "declared", widening_rad)
+    sigma = 0.5 * wide.widening(nearest_ray_angles(points, exact, centres))
+    pixel = exact.pixel + sigma[:, None] * rng.normal(size=(len(point), 2))
+    solved = triangulate(views, point, view, pixel, exact.sigma_px, count)
+    observations = Observations(point, view, pixel, exact.sigma_px, exact.keypoint)
+    names = tuple(str(i) for i in range(40))
+    problem = Problem(names, (CAMERA,) * 40, tuple(poses), solved.points, observations)
+    return problem, Solution(tuple(poses), solved.points, np.zeros((0, 3)), 1, True)
+
+
+@pytest.mark.parametrize("true_deg", [5.0, 15.0, 40.0])
+def test_how_keypoints_grow_uncertain_with_the_angle_is_recovered(true_deg: float) -> None:
+    found = [np.degrees(widening_angle(*around(np.random.default_rng([3, i]), np.radians(true_deg)))) for i in range(3)]
+    assert 0.75 * true_deg < np.median(found) < 1.35 * true_deg
+
+
+def test_no_growth_with_the_angle_is_nearly_none() -> None:
+    assert np.degrees(widening_angle(*around(np.random.default_rng(4), np.inf))) > 200.0

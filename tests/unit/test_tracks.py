@@ -12,6 +12,7 @@ from georef.estimation.tracks import (
     PairMatches,
     build_tracks,
     distributed,
+    nearest_ray_angles,
     quantized,
     select_points,
     triangulated_tracks,
@@ -169,3 +170,12 @@ def test_select_points_renumbers() -> None:
     np.testing.assert_array_equal(3 * kept.point, obs.point[keep[obs.point]])
     empty, none = select_points(points, replace(obs), np.zeros(300, bool))
     assert (len(empty), len(none)) == (0, 0)
+
+
+def test_the_angle_of_each_ray_to_the_nearest_other_of_its_point() -> None:
+    across = np.radians([0.0, 10.0, 35.0, 90.0])
+    centres = np.column_stack([np.sin(across), np.cos(across), np.zeros(4)]) * [[1.0], [2.0], [3.0], [4.0]]
+    point, view = np.array([0, 1, 0, 1, 0, 2]), np.array([2, 0, 0, 3, 1, 1])
+    observations = Observations(point, view, np.zeros((6, 2)), np.ones(6), np.arange(6))
+    angle = np.degrees(nearest_ray_angles(np.zeros((3, 3)), observations, centres))
+    np.testing.assert_allclose(angle, [25.0, 90.0, 10.0, 90.0, 10.0, np.inf], atol=1e-9)

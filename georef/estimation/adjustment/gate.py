@@ -42,6 +42,14 @@ def residual_scale(problem: Problem, solution: Solution) -> float:
     return _Tested.at(problem, solution).scale if len(problem.observations) else 1.0
 
 
+def variance_ratios(problem: Problem, solution: Solution) -> Array:
+    """Squared residuals of the image observations (n,) against their variances, of median 1 where the sigmas are true.
+
+    NaN where an observation is not checked by others.
+    """
+    return _Tested.at(problem, solution).variance_ratio
+
+
 def gate_observations(problem: Problem, solution: Solution, probability: float) -> tuple[Problem, int]:
     """The problem without image observations and automatic GCPs that contradict their point, and how many were dropped.
 
@@ -68,6 +76,7 @@ class _Tested:
     statistic: Array  # (n,)
     rank: NDArray[np.int64]  # (n,)
     usable: NDArray[np.bool_]  # (n,) in front of the camera, and of a point that is determined
+    variance_ratio: Array  # (n,) statistic over its median where the sigmas are true; NaN where unchecked
     scale: float  # of the residuals, by the median
     point_inverse: Array  # (P, 3, 3)
 
@@ -85,9 +94,10 @@ class _Tested:
         inverse: Array = np.linalg.inv(normal).astype(np.float64)
         statistic, rank = _statistic(residual, np.eye(2) - by_point @ inverse[obs.point] @ np.swapaxes(by_point, 1, 2))
         checked = (rank > 0) & ~behind
-        scale2 = float(np.median(statistic[checked] / _MEDIAN[rank[checked]])) if checked.any() else 1.0
+        ratio = np.where(checked, statistic / _MEDIAN[rank], np.nan)
+        scale2 = float(np.nanmedian(ratio)) if checked.any() else 1.0
         scale = float(np.sqrt(max(scale2, 1e-12)))
-        return _Tested(statistic, rank, ~behind & ~singular[obs.point], scale, inverse)
+        return _Tested(statistic, rank, ~behind & ~singular[obs.point], ratio, scale, inverse)
 
 
 def gate_priors(

@@ -1,0 +1,60 @@
+"""Tie points of the new images: the pairs that are matched, wrong matches, and how many rays a point needs."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from georef.config import AdjustConfig
+from georef.estimation.epoch_problem import match_new_images, tie_pairs
+from georef.executor import Silent
+from georef.features.nearest import MutualNearest
+from georef.types.results import Localized
+from tests.worlds.blocks import block
+from tests.worlds.points import Seen, court, loose_cov, photograph
+
+
+def photographs(seed: int, **options: float) -> tuple[list[Seen], list[Localized]]:
+    world, rng = court(seed, queries=5, points=400), np.random.default_rng(seed)
+    seen = [photograph(world, pose, rng, **options) for pose in world.queries]  # pyright: ignore[reportArgumentType]
+    results = []
+    for i, image in enumerate(seen):
+        points = world.points[image.point[image.point >= 0]]
+        cov = loose_cov(image.truth, 0.02, 0.001)
+        results.append(Localized(f"q{i}", image.truth, cov, cov, len(points), 1.0, (), points, np.arange(len(points))))
+    return seen, results
+
+
+def test_each_image_is_matched_with_the_neighbours_that_see_most_of_it() -> None:
+    seen, results = photographs(1)
+    images = [s.posed() for s in seen]
+    everything = tie_pairs(images, results, 4)
+    assert everything == [(i, j) for i in range(5) for j in range(i + 1, 5)]
+    few = tie_pairs(images, results, 1)
+    assert set(few) < set(everything)
+    assert {i for pair in few for i in pair} == set(range(5))
+    assert (0, 4) not in few  # the outermost of the row share least
+
+
+def test_matches_off_the_epipolar_lines_are_left_out() -> None:
+    seen, results = photographs(2, blunders=0.3)
+    images = [s.posed() for s in seen]
+    pairs = tie_pairs(images, results, 4)
+    found = match_new_images(images, pairs, MutualNearest(), 1000, 3.0, Silent())
+    assert [(m.a, m.b) for m in found] == pairs
+    wrong = np.concatenate(
+        [seen[m.a].blunder[m.indices[:, 0]] | seen[m.b].blunder[m.indices[:, 1]] for m in found]
+    ).mean()
+    assert wrong < 0.12  # of 0.5 among all matches; along the line nothing tells
+    strongest = match_new_images(images, pairs, MutualNearest(), 100, 3.0, Silent())
+    assert max(int(m.indices.max()) for m in strongest) < 100
+
+
+def test_a_tie_point_has_as_many_rays_as_asked_for() -> None:
+    for rays in (2, 3, 4):
+        config = AdjustConfig(gnss=False, min_tie_point_rays=rays, max_tie_points_per_image=5000)
+        problem = block(3, references=2, queries=6, config=config).problem
+        count = np.bincount(problem.observations.point, minlength=len(problem.points))
+        tie = np.ones(len(problem.points), bool)
+        tie[problem.gcps.point] = False
+        assert tie.sum() > 3
+        assert (count[tie] >= rays).all()
