@@ -208,3 +208,10 @@ def test_the_command_line_starts_light() -> None:
     code = "import sys, georef.cli; print(' '.join({name.split('.')[0] for name in sys.modules}))"
     finished = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True)
     assert heavy & set(finished.stdout.split()) == set()
+
+
+def test_the_simulated_truth_is_out_of_the_pipeline_s_reach() -> None:
+    """Only the verb `demo` knows the simulation; the stages that it runs are those of any project."""
+    outside = [path for path in SOURCES if room(path) != "simulate"]
+    importers = [path for path in outside if "simulate" in {name for _, name in imported_rooms(path)}]
+    assert importers == [PACKAGE / "stages" / "demo.py"]

@@ -198,7 +198,7 @@ def _write_epoch(world: StreetWorld, epoch: NewEpoch, survey: PointSurvey, folde
 
 
 def _write_truth(world: StreetWorld, survey: PointSurvey, folder: Path) -> None:
-    """Exact poses of drives and epochs, as they are and as the reference would have them; points, tie points, changes."""
+    """Poses of drives and epochs, exact and as the reference would have them; points, tie points, changes."""
     frame = world.frame
     drives = {campaign: world.images_of(campaign) for campaign in world.rigs}
     for name, images in (drives | {epoch.name: list(epoch.images) for epoch in new_epochs(world)}).items():

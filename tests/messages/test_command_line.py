@@ -27,6 +27,7 @@ VERBS = [
     "init",
     "doctor",
     "run",
+    "demo",
     "status",
     "report",
     "view",

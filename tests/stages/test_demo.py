@@ -44,7 +44,7 @@ def test_the_pipeline_needs_no_truth_and_comes_close_to_it(finished: Project) ->
         errors = evaluate(finished.published(epoch) / "poses.csv", truth).errors
         assert len(errors.failed) <= 1
         assert 0.0003 < errors.position_m.median_estimated < 0.03
-        assert 0.0003 < errors.rotation_deg.median_estimated < 0.05
+        assert 0.0003 < errors.rotation_deg.median_estimated < 0.1  # half the resolution of the demo
         assert len(against_truth(finished, epoch)) == 2
     report = json.loads((finished.published("second") / "report.json").read_text(encoding="utf-8"))
     assert report["check_points"]["count"] >= 3
