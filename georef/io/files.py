@@ -1,4 +1,4 @@
-"""Text files: read in whatever encoding they have, written as a whole or not at all."""
+"""Files: text read in whatever encoding it has, anything written as a whole or not at all."""
 
 from __future__ import annotations
 
@@ -48,15 +48,20 @@ def read_text(path: Path, encoding: str | None = None) -> str:
 
 
 def write_text_atomically(text: str, path: Path | str) -> None:
-    """Write UTF-8 text with '\\n' line ends to a temporary file beside `path`, then put it in place.
+    """Write UTF-8 text with '\\n' line ends as a whole, as `write_bytes_atomically` does."""
+    write_bytes_atomically(text.encode("utf-8"), path)
+
+
+def write_bytes_atomically(data: bytes, path: Path | str) -> None:
+    """Write to a temporary file beside `path`, then put it in place.
 
     Folders are created. An existing file stays as it is until the new one is complete. Raises OSError.
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex}.tmp")
+    temporary = path.with_name(f".{uuid.uuid4().hex}.tmp")  # short: names of items may be as long as a name can be
     try:
-        temporary.write_text(text, encoding="utf-8", newline="")
+        temporary.write_bytes(data)
         temporary.replace(path)
     finally:
         temporary.unlink(missing_ok=True)

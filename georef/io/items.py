@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import json
-import secrets
 import zipfile
 from pathlib import Path
 from typing import Any
@@ -14,6 +13,7 @@ import numpy as np
 
 from georef.errors import StageError
 from georef.geometry.rigid import Rigid3
+from georef.io.files import write_bytes_atomically
 from georef.types.results import Localized, Outcome, ReferenceMatches, Rejected, RejectReason
 
 _HEADER = "header_json"
@@ -32,16 +32,10 @@ def item_ids(folder: Path) -> set[str]:
 
 def write_item(path: Path, header: dict[str, Any], arrays: dict[str, np.ndarray]) -> None:
     """Writes a header and arrays under a temporary name, then puts the file in place."""
-    path.parent.mkdir(parents=True, exist_ok=True)
     buffer = io.BytesIO()
     encoded = np.frombuffer(json.dumps(header).encode(), dtype=np.uint8)
     np.savez(buffer, allow_pickle=False, **{_HEADER: encoded}, **arrays)
-    temporary = path.with_name(f".{secrets.token_hex(8)}.tmp")
-    try:
-        temporary.write_bytes(buffer.getvalue())
-        temporary.replace(path)
-    finally:
-        temporary.unlink(missing_ok=True)
+    write_bytes_atomically(buffer.getvalue(), path)
 
 
 def read_item(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:

@@ -8,7 +8,6 @@ conf_*.png from 0 (guessed) to 2 (sure), pictures for some frames, info.json for
 from __future__ import annotations
 
 import json
-import secrets
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -20,7 +19,7 @@ from pyproj import Transformer
 
 from georef.geometry.angles import IMAGE_FROM_CAM, rotation_z
 from georef.geometry.rigid import Array, Rigid3, exp_so3
-from georef.io.files import write_text_atomically
+from georef.io.files import write_bytes_atomically, write_text_atomically
 from georef.simulate import tables
 from georef.simulate.photography import Photography
 from georef.simulate.render import render
@@ -184,9 +183,4 @@ def _write_png(image: Array | NDArray[np.integer], path: Path) -> None:
 
 
 def _write(data: NDArray[np.uint8], path: Path) -> None:
-    temporary = path.with_name(f".{path.name}.{secrets.token_hex(6)}.tmp")
-    try:
-        temporary.write_bytes(data.tobytes())
-        temporary.replace(path)
-    finally:
-        temporary.unlink(missing_ok=True)
+    write_bytes_atomically(data.tobytes(), path)

@@ -7,7 +7,6 @@ belongs to one world; what is there of it is kept.
 from __future__ import annotations
 
 import json
-import secrets
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -18,7 +17,7 @@ import cv2
 
 from georef.errors import InputError
 from georef.geometry.camera import Camera
-from georef.io.files import write_text_atomically
+from georef.io.files import write_bytes_atomically, write_text_atomically
 from georef.simulate import tables
 from georef.simulate.street import Change
 from georef.simulate.survey import PointSurvey, SurveyQuality, survey_points
@@ -171,15 +170,9 @@ def new_epochs(world: StreetWorld) -> list[NewEpoch]:
 def write_image(world: StreetWorld, image_id: str, folder: Path) -> None:
     """One photograph as a JPEG file, under a temporary name until it is complete."""
     path = image_path(world, image_id, folder)
-    path.parent.mkdir(parents=True, exist_ok=True)
     bgr = cv2.cvtColor(world.render_image(image_id), cv2.COLOR_RGB2BGR)
     _, data = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])
-    temporary = path.with_name(f".{path.name}.{secrets.token_hex(6)}.tmp")
-    try:
-        temporary.write_bytes(data.tobytes())
-        temporary.replace(path)
-    finally:
-        temporary.unlink(missing_ok=True)
+    write_bytes_atomically(data.tobytes(), path)
 
 
 def _write_reference(world: StreetWorld, folder: Path) -> None:
