@@ -12,7 +12,7 @@ from georef.config import AdjustConfig
 from georef.errors import StageError
 from georef.estimation.adjustment.problem import AutomaticGcps, Problem
 from georef.estimation.candidates import overlap
-from georef.estimation.guided import PosedFeatures, epipolar_band
+from georef.estimation.guided import PosedFeatures, epipolar_distances
 from georef.estimation.local_model import triangulate_consistent
 from georef.estimation.reference_map import ReferenceMap
 from georef.estimation.tracks import (
@@ -66,24 +66,39 @@ def _seen_by(images: Sequence[PosedFeatures], result: Localized) -> NDArray[np.i
 
 def match_new_images(
     images: Sequence[PosedFeatures],
+    localized: Sequence[Localized],
     pairs: Sequence[tuple[int, int]],
     matcher: Matcher,
     keypoints: int,
     gate: float,
     progress: Progress,
 ) -> list[PairMatches]:
-    """Matches of pairs of new images, the strongest keypoints of each, that lie in the epipolar band of their poses."""
+    """Matches of pairs of new images, the strongest keypoints of each, near each other's epipolar lines.
+
+    `gate` is the largest distance, in keypoint scales combined with what the uncertainty of the poses amounts to.
+    """
+    pose_px = [_pose_sigma_px(image, result) for image, result in zip(images, localized, strict=True)]
     out = []
     progress.begin("tie points", len(pairs))
     for i, j in pairs:
         a, b = images[i], images[j]
         found = matcher.match(a.features.head(keypoints), b.features.head(keypoints)).indices
-        found = found[epipolar_band(a, b, gate)[found[:, 0], found[:, 1]]]
+        scales = np.column_stack([a.features.scales_px[found[:, 0]], b.features.scales_px[found[:, 1]]])
+        allowed = gate * np.hypot(scales, np.hypot(pose_px[i], pose_px[j]))
+        found = found[(epipolar_distances(a, b, found) <= allowed).all(axis=1)]
         if len(found) >= _LEAST_PAIR_MATCHES:
             out.append(PairMatches(i, j, found))
         progress.advance()
     progress.end()
     return out
+
+
+def _pose_sigma_px(image: PosedFeatures, result: Localized) -> float:
+    """By how much the uncertainty of a pose moves the points that it rests on, in its image: 1-sigma, the median."""
+    views = Views.of([result.world_from_cam], [image.camera])
+    by_pose = linearize(views, np.zeros(len(result.points_in_world), np.int64), result.points_in_world).by_pose
+    variance = np.einsum("nki,ij,nkj->n", by_pose, result.world_from_cam_cov, by_pose) / 2.0
+    return float(np.sqrt(np.nanmedian(variance)))
 
 
 def epoch_problem(

@@ -68,6 +68,16 @@ def guided_matches(a: PosedFeatures, b: PosedFeatures, options: GuidedOptions, k
     return Matches(np.concatenate([kept.indices, pairs]), np.concatenate([kept.scores, score[keep].astype(np.float32)]))
 
 
+def epipolar_distances(a: PosedFeatures, b: PosedFeatures, indices: NDArray[np.integer]) -> Array:
+    """Distances (M, 2) in pixels of matched keypoints (M, 2) from each other's epipolar lines, in a and in b."""
+    f = fundamental_matrix(a, b)
+    in_a = np.column_stack([a.ideal_px[indices[:, 0]], np.ones(len(indices))])
+    in_b = np.column_stack([b.ideal_px[indices[:, 1]], np.ones(len(indices))])
+    line_in_a, line_in_b = in_b @ f, in_a @ f.T
+    off = np.abs(np.einsum("ni,ni->n", in_b, line_in_b))
+    return np.column_stack([off / np.linalg.norm(line[:, :2], axis=1) for line in (line_in_a, line_in_b)])
+
+
 def epipolar_band(a: PosedFeatures, b: PosedFeatures, gate: float) -> NDArray[np.bool_]:
     """(N, M) pairs whose distance from each other's epipolar line is at most `gate` keypoint scales in both images.
 

@@ -67,7 +67,7 @@ def run(context: StageContext) -> StageSummary:
     if config.adjust.tie_points:
         pairs = tie_pairs(posed, localized, config.adjust.tie_neighbours)
         keypoints, gate = config.matching.max_keypoints, config.localize.guided_gate
-        ties = match_new_images(posed, pairs, task.matcher, keypoints, gate, context.executor.progress)
+        ties = match_new_images(posed, localized, pairs, task.matcher, keypoints, gate, context.executor.progress)
     problem = epoch_problem(images, localized, posed, ties, reference, context.survey.control, config.adjust)
     adjusted = adjust(problem, config.adjust)
     data = _data(problem, adjusted)

@@ -39,13 +39,13 @@ def test_matches_off_the_epipolar_lines_are_left_out() -> None:
     seen, results = photographs(2, blunders=0.3)
     images = [s.posed() for s in seen]
     pairs = tie_pairs(images, results, 4)
-    found = match_new_images(images, pairs, MutualNearest(), 1000, 3.0, Silent())
+    found = match_new_images(images, results, pairs, MutualNearest(), 1000, 3.0, Silent())
     assert [(m.a, m.b) for m in found] == pairs
     wrong = np.concatenate(
         [seen[m.a].blunder[m.indices[:, 0]] | seen[m.b].blunder[m.indices[:, 1]] for m in found]
     ).mean()
-    assert wrong < 0.12  # of 0.5 among all matches; along the line nothing tells
-    strongest = match_new_images(images, pairs, MutualNearest(), 100, 3.0, Silent())
+    assert wrong < 0.16  # of 0.5 among all matches; along the line nothing tells, and the poses allow for 3 px
+    strongest = match_new_images(images, results, pairs, MutualNearest(), 100, 3.0, Silent())
     assert max(int(m.indices.max()) for m in strongest) < 100
 
 
