@@ -31,11 +31,20 @@ class MatchingConfig(Section):
     options: dict[str, str | int | float | bool] = {}
 
 
+class RetrievalConfig(Section):
+    descriptor: str = "vlad"
+    options: dict[str, str | int | float | bool] = {}
+
+
 class CandidatesConfig(Section):
-    box: Literal["reach", "published"] = "reach"
+    box: Literal["reach", "published", "fixed", "none"] = "reach"
     min_half_side_m: float = Field(default=15.0, gt=0)
     viewing_reach_m: float = Field(default=30.0, gt=0)
+    half_side_m: float = Field(default=100.0, gt=0)
     heading_window_deg: float = Field(default=90.0, gt=0, le=180)
+    epochs: list[str] = []
+    ranking: Literal["global-votes", "global", "votes"] = "votes"
+    shortlist: int = Field(default=50, ge=2)
     count: int = Field(default=10, ge=2)
     first_count: int = Field(default=4, ge=2)
     vote_keypoints: int = Field(default=512, ge=16)
@@ -101,6 +110,7 @@ class RunConfig(Section):
 class Config(Section):
     features: FeaturesConfig = FeaturesConfig()
     matching: MatchingConfig = MatchingConfig()
+    retrieval: RetrievalConfig = RetrievalConfig()
     candidates: CandidatesConfig = CandidatesConfig()
     localize: LocalizeConfig = LocalizeConfig()
     network: NetworkConfig = NetworkConfig()

@@ -21,24 +21,29 @@ _MAX_VIEWING_ANGLE_DEG = 60.0
 
 @dataclass(frozen=True, eq=False)
 class Box:
-    """The references inside the search box, nearest first."""
+    """The references inside the search box, nearest first; without a box all of them, in their own order."""
 
     indices: NDArray[np.int64]
     whole_reference: bool
     note: str = ""
+    centre: Array | None = None  # (3,) m
+    half_side_m: float | None = None
 
 
 def search_box(positions: Array, prior: PositionPrior | None, config: CandidatesConfig) -> Box:
     """References (of positions (N, 3)) inside a square box about a position prior; widened until there are enough.
 
-    `published` takes the stated uncertainty as half the side; `reach` max(min_half_side, 3 sigma + viewing reach).
+    Half the side is the stated uncertainty ("published"), max(min_half_side, 3 sigma + viewing reach) ("reach"), or
+    half_side_m ("fixed"); "none" takes the whole reference, as an image without a prior does. References whose
+    position is NaN do not take part.
     """
+    everything = np.flatnonzero(np.isfinite(positions[:, :2]).all(axis=1))
+    if config.box == "none":
+        return Box(everything, True)
     if prior is None:
-        return Box(np.arange(len(positions)), True, "no position prior: searched the whole reference")
+        return Box(everything, True, "no position prior: searched the whole reference")
     offset = np.abs(positions[:, :2] - prior.position_in_world[:2]).max(axis=1)
-    sigma = float(np.sqrt(np.linalg.eigvalsh(prior.cov[:2, :2])[-1]))
-    reach = max(config.min_half_side_m, 3.0 * sigma + config.viewing_reach_m)
-    asked = sigma if config.box == "published" else reach
+    asked = _half_side(prior, config)
     half_side, needed = asked, min(config.count, int(np.isfinite(offset).sum()))
     while np.count_nonzero(offset <= half_side) < needed:
         half_side *= 2.0
@@ -47,7 +52,17 @@ def search_box(positions: Array, prior: PositionPrior | None, config: Candidates
     if half_side > asked:
         found = np.count_nonzero(offset <= asked)
         note = f"search box widened from {asked:.1f} to {half_side:.1f} m half side: {found} of {needed} references"
-    return Box(inside[np.argsort(offset[inside], kind="stable")], len(inside) == len(positions), note)
+    order = np.argsort(offset[inside], kind="stable")
+    return Box(inside[order], len(inside) == len(everything), note, prior.position_in_world, half_side)
+
+
+def _half_side(prior: PositionPrior, config: CandidatesConfig) -> float:
+    sigma = float(np.sqrt(np.linalg.eigvalsh(prior.cov[:2, :2])[-1]))
+    if config.box == "fixed":
+        return config.half_side_m
+    if config.box == "published":
+        return sigma
+    return max(config.min_half_side_m, 3.0 * sigma + config.viewing_reach_m)
 
 
 def in_heading_window(headings_rad: Array, heading_rad: float | None, window_deg: float) -> NDArray[np.bool_]:

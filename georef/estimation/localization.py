@@ -12,12 +12,13 @@ from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from georef.config import CandidatesConfig, LocalizeConfig
-from georef.estimation.candidates import Box, in_heading_window, overlap, search_box, vote
+from georef.estimation.candidates import Box, overlap, search_box
 from georef.estimation.guided import GuidedOptions, PosedFeatures, guided_matches
 from georef.estimation.local_model import LocalModel, query_centred_model
 from georef.estimation.pnp import EstimatedPose, QueryImage, ransac_pose, refine_pose, refit_pose, with_covariance
 from georef.estimation.published import VerifyPair, published_model, verify_pair
 from georef.estimation.reference_map import ReferenceMap
+from georef.estimation.search import FindSimilar, Search
 from georef.features.base import Matcher
 from georef.geometry.covariance import position_cov_in_world
 from georef.geometry.rigid import Rigid3
@@ -37,9 +38,9 @@ class _Work:
     features: Features
     reference: ReferenceMap
     matcher: Matcher
-    candidates: CandidatesConfig
     config: LocalizeConfig
     match_keypoints: int
+    search: Search
     query: QueryImage = field(init=False)
     posed: PosedFeatures = field(init=False)
     cpu_s: dict[str, float] = field(default_factory=dict)
@@ -63,51 +64,44 @@ def localize_image(
     candidates: CandidatesConfig,
     config: LocalizeConfig,
     match_keypoints: int,
+    find_similar: FindSimilar | None = None,
 ) -> Outcome:
     """The pose of one image with its covariance, or why there is none.
 
-    References inside the position prior's box are tried first, then the whole reference.
+    References inside the position prior's box are tried first, then the whole reference. find_similar: the vector
+    database, asked for this image; needed for every ranking but "votes".
     """
     if len(features) < config.min_inliers:
         return Rejected(image.image_id, RejectReason.FEW_FEATURES, f"{len(features)} keypoints")
-    work = _Work(image, features, reference, matcher, candidates, config, match_keypoints)
-    box = search_box(reference.positions, image.gnss, candidates)
+    search = Search(reference, features, image.heading_rad, candidates, find_similar)
+    work = _Work(image, features, reference, matcher, config, match_keypoints, search)
+    box = search_box(search.positions, image.gnss, candidates)
     outcome = _localize_in(work, box)
     if isinstance(outcome, Rejected) and not box.whole_reference:
         work.notes.append(
             f"inside the search box: {outcome.reason.value} ({outcome.detail}); tried the whole reference"
         )
-        outcome = _localize_in(work, search_box(reference.positions, None, candidates))
+        outcome = _localize_in(work, search_box(search.positions, None, candidates))
     return replace(_against_prior(outcome, image, config), notes=tuple(work.notes))
 
 
 def _localize_in(work: _Work, box: Box) -> Outcome:
     if box.note:
         work.notes.append(box.note)
-    in_window = in_heading_window(
-        work.reference.headings_rad[box.indices], work.image.heading_rad, work.candidates.heading_window_deg
-    )
-    inside = box.indices[in_window][: work.candidates.max_searched]
-    if len(inside) < 2:
-        return Rejected(work.image.image_id, RejectReason.NO_CANDIDATES, f"{len(inside)} reference images")
-    if len(inside) < len(box.indices[in_window]):
-        work.notes.append(f"searched the nearest {len(inside)} of {len(box.indices)} references")
-    ranked = _rank_by_votes(work, inside)
+    with work.timed("candidates"):
+        ranked, note = work.search.ranked(box)
+    if note:
+        work.notes.append(note)
+    if len(ranked) < 2:
+        return Rejected(work.image.image_id, RejectReason.NO_CANDIDATES, f"{len(ranked)} reference images")
     method = _published if work.config.method == "published" else _query_centred
     return method(work, ranked)
-
-
-def _rank_by_votes(work: _Work, indices: NDArray[np.int64]) -> NDArray[np.int64]:
-    with work.timed("candidates"):
-        count = work.candidates.vote_keypoints
-        votes = vote(work.features.head(count), [work.reference.head(int(i), count) for i in indices])
-        return indices[np.argsort(-votes, kind="stable")]
 
 
 def _query_centred(work: _Work, ranked: NDArray[np.int64]) -> Outcome:
     """A first pose from a few references by the matcher, then guided matching in all that see the same points."""
     first = None
-    for count in sorted({work.candidates.first_count, work.candidates.count}):
+    for count in sorted({work.search.config.first_count, work.search.config.count}):
         first = _first_pose(work, [int(i) for i in ranked[:count]])
         if not isinstance(first, Rejected):
             break
@@ -156,11 +150,12 @@ def _that_see(work: _Work, ranked: NDArray[np.int64], pose: Rigid3, model: Local
     with work.timed("candidates"):
         directions = model.points - pose.translation
         directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-        cameras = [work.reference.images[int(i)].camera for i in ranked]
+        asked = work.search.with_neighbours(ranked, pose.translation)
+        cameras = [work.reference.images[int(i)].camera for i in asked]
         sizes = np.array([[c.width, c.height] for c in cameras], dtype=float)
-        seen = overlap(model.points, directions, work.reference.views([int(i) for i in ranked]), sizes)
+        seen = overlap(model.points, directions, work.reference.views([int(i) for i in asked]), sizes)
         order = np.argsort(-seen, kind="stable")
-        return [int(ranked[i]) for i in order[: work.candidates.count] if seen[i] > 0]
+        return [int(asked[i]) for i in order[: work.search.config.count] if seen[i] > 0]
 
 
 def _guided(work: _Work, pose: Rigid3, index: int) -> Matches:
@@ -171,7 +166,7 @@ def _guided(work: _Work, pose: Rigid3, index: int) -> Matches:
 
 def _published(work: _Work, ranked: NDArray[np.int64]) -> Outcome:
     """All pairs among the query and its candidates matched; COLMAP's triangulation from the fixed reference poses."""
-    chosen = sorted(int(i) for i in ranked[: work.candidates.count])
+    chosen = sorted(int(i) for i in ranked[: work.search.config.count])
     references = [work.reference.posed(i) for i in chosen]
     with work.timed("matching"):
         model = published_model(references, _pair_verifier(work, chosen, references), work.reference.noise)

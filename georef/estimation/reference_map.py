@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from georef.estimation.guided import PosedFeatures
 from georef.geometry.projection import Views
@@ -31,6 +32,7 @@ class ReferenceMap:
         self.positions: Array = np.array([pose.translation for pose in self.poses]).reshape(-1, 3)
         forward = np.array([pose.rotation[:, 2] for pose in self.poses]).reshape(-1, 3)
         self.headings_rad: Array = np.arctan2(forward[:, 0], forward[:, 1])
+        self.epochs: NDArray[np.str_] = np.array([image.epoch for image in self.images], dtype=str)
         self.pairs: dict[tuple[int, int], Any] = {}  # verified pairs of references, filled by the published way
         self._read = read_features
         self._heads: OrderedDict[tuple[int, int], Features] = OrderedDict()

@@ -33,6 +33,7 @@ def line_of_positions(spacing: float, count: int = 41) -> Array:
         ({"box": "reach"}, 6.0, 48.0),  # 3 sigma + 30
         ({"box": "reach", "viewing_reach_m": 1.0}, 2.0, 15.0),  # at least min_half_side_m
         ({"box": "reach", "viewing_reach_m": 1.0, "min_half_side_m": 4.0}, 2.0, 7.0),
+        ({"box": "fixed", "half_side_m": 9.0}, 2.0, 9.0),
     ],
 )
 def test_half_side(options: dict[str, str], sigma: float, half_side: float) -> None:
@@ -79,6 +80,21 @@ def test_whole_reference_without_a_prior() -> None:
     np.testing.assert_array_equal(box.indices, np.arange(41))
     assert box.whole_reference
     assert "no position prior" in box.note
+
+
+def test_no_box_on_request_even_with_a_prior() -> None:
+    box = search_box(line_of_positions(50.0), prior(1.0), CandidatesConfig(box="none"))
+    assert (len(box.indices), box.whole_reference, box.half_side_m) == (41, True, None)
+
+
+def test_references_that_do_not_take_part_are_not_counted() -> None:
+    positions = line_of_positions(10.0)
+    positions[::2] = np.nan
+    box = search_box(positions, prior(1.0), CandidatesConfig(box="fixed", half_side_m=51.0, count=4))
+    assert set(box.indices) == {15, 17, 19, 21, 23, 25}
+    assert not box.whole_reference
+    box = search_box(positions, prior(1.0), CandidatesConfig(box="fixed", half_side_m=1000.0))
+    assert (len(box.indices), box.whole_reference) == (20, True)
 
 
 def test_no_references_at_all() -> None:

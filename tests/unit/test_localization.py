@@ -29,7 +29,7 @@ from tests.worlds.points import (
     scaled_noise,
 )
 
-_CANDIDATES = CandidatesConfig()
+_CANDIDATES = CandidatesConfig(ranking="votes")
 _CONFIG = LocalizeConfig()
 _EXACT = scaled_noise(NOISE, poses=1e-6)
 
