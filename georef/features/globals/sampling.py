@@ -33,7 +33,7 @@ class Reservoir:
         return np.where(order < self._capacity, order, np.where(drawn < self._capacity, drawn, -1))
 
     def put(self, places: NDArray[np.int64], rows: NDArray[np.floating]) -> None:
-        """Put rows (n, D) where `places` (n,) said; those of -1 are left out, a later row takes an earlier one's place."""
+        """Put rows (n, D) where `places` (n,) said; -1 leaves out. A later row replaces an earlier one."""
         kept = places >= 0
         if not kept.any():
             return
