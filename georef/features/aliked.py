@@ -9,7 +9,7 @@ from georef.features.aliked_network import AlikedNetwork
 from georef.features.aliked_peaks import find_peaks
 from georef.features.base import Detections, Image
 from georef.features.device import choose_device
-from georef.features.weights import WEIGHTS, load_state_dict
+from georef.features.weights import load_state_dict, version_tag
 
 
 class AlikedN16:
@@ -34,7 +34,7 @@ class AlikedN16:
         self._network = AlikedNetwork(load_state_dict(self.name), self._device)
 
     def version(self) -> str:
-        weights = WEIGHTS[self.name].sha256[:12]
+        weights = version_tag(self.name)
         settings = f"threshold={self._threshold} device={self._device.type}"
         return f"{self.name}-1 torch={torch.__version__} weights={weights} {settings}"
 

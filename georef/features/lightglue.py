@@ -11,7 +11,7 @@ from torch import Tensor
 from georef.errors import ConfigError
 from georef.features.device import choose_device
 from georef.features.lightglue_network import LightGlueNetwork
-from georef.features.weights import WEIGHTS, load_state_dict
+from georef.features.weights import load_state_dict, version_tag
 from georef.types.features import Features, Matches
 
 Precision = Literal["auto", "float32", "bfloat16"]
@@ -50,7 +50,7 @@ class LightGlueAliked:
         self._network = LightGlueNetwork(load_state_dict(self.weights), dtype=dtype, device=self._device)
 
     def version(self) -> str:
-        weights = WEIGHTS[self.weights].sha256[:12]
+        weights = version_tag(self.weights)
         settings = f"keypoints={self._max_keypoints} min_score={self._min_score} precision={self._precision}"
         return f"{self.name}-1 torch={torch.__version__} weights={weights} {settings}"
 

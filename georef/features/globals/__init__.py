@@ -1,0 +1,1 @@
+"""Global descriptors: one vector an image, by which images of the same place are found."""
