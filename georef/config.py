@@ -43,7 +43,7 @@ class CandidatesConfig(Section):
     half_side_m: float = Field(default=100.0, gt=0)
     heading_window_deg: float = Field(default=90.0, gt=0, le=180)
     epochs: list[str] = []
-    ranking: Literal["global-votes", "global", "votes"] = "votes"
+    ranking: Literal["global-votes", "global", "votes"] = "global-votes"
     shortlist: int = Field(default=50, ge=2)
     count: int = Field(default=10, ge=2)
     first_count: int = Field(default=4, ge=2)

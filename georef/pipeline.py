@@ -18,7 +18,7 @@ from georef.config import Config
 from georef.executor import Executor
 from georef.io.files import write_text_atomically
 from georef.project import Project
-from georef.stages import adjust, features, localize, network, report
+from georef.stages import adjust, features, index, localize, network, report
 from georef.stages.base import Meter, Run, StageContext, StageSummary
 from georef.stages.survey import Survey, load_survey
 from georef.types.campaign import Campaign
@@ -37,6 +37,7 @@ class Stage:
     reads: Callable[[Project, Survey], dict[str, Any]]
     needs: tuple[str, ...]  # stages before it
     run: Run
+    of_reference: bool = False  # looks at the reference alone: done once for all epochs
 
 
 def _reference_files(project: Project, survey: Survey) -> dict[str, Any]:
@@ -52,8 +53,13 @@ def _epoch_files(project: Project, survey: Survey) -> dict[str, Any]:
 
 
 def _all_images(project: Project, survey: Survey) -> dict[str, Any]:
-    states = [_state(image.path) for campaign in (survey.reference, survey.epoch) for image in campaign.images]
-    return {"images": _hash(states)}
+    return {"images": _states_of(survey.reference, survey.epoch)}
+
+
+def _reference_with_images(project: Project, survey: Survey) -> dict[str, Any]:
+    features_version = features.extractor_version(project.config.features)
+    reference = {"features": features_version, "images": _states_of(survey.reference)}
+    return {**_reference_files(project, survey), **reference}
 
 
 def _control(project: Project, survey: Survey) -> dict[str, Any]:
@@ -74,10 +80,14 @@ _NETWORK_KEYS = (
     "adjust.max_iterations",
 )
 
+_INDEX_KEYS = ("retrieval", "candidates.ranking")
+_LOCALIZE_KEYS = ("matching", "candidates", "localize")
+
 STAGES: tuple[Stage, ...] = (
     Stage("features", 1, ("features",), _all_images, (), features.run),
-    Stage("network", 2, _NETWORK_KEYS, _reference_files, ("features",), network.run),
-    Stage("localize", 2, ("matching", "candidates", "localize"), _epoch_files, ("features", "network"), localize.run),
+    Stage("network", 2, _NETWORK_KEYS, _reference_with_images, (), network.run, of_reference=True),
+    Stage("index", 1, _INDEX_KEYS, _reference_with_images, (), index.run, of_reference=True),
+    Stage("localize", 3, _LOCALIZE_KEYS, _epoch_files, ("features", "network", "index"), localize.run),
     Stage("adjust", 3, ("adjust", "localize", "matching"), _control, ("features", "network", "localize"), adjust.run),
     Stage("report", 1, ("report",), _check, ("features", "network", "localize", "adjust"), report.run),
 )
@@ -129,15 +139,30 @@ def _plan(
     for stage in STAGES:
         parts = {
             "stage version": stage.version,
-            "components": version if stage.name == "features" else localize.components(project.config, stage.name),
+            "components": _components(stage, project.config),
             **{f"[{name}]": _setting(project.config, name) for name in stage.sections},
             **stage.reads(project, survey),
             **{f"stage {name}": prints[name] for name in stage.needs},
         }
         prints[stage.name] = _hash(parts)[:12]
-        folder = project.stage_folder(epoch, stage.name, prints[stage.name])
+        folder = project.stage_folder(_scope(stage, epoch), stage.name, prints[stage.name])
         yield stage, folder, parts, dict(before)
         before[stage.name] = folder
+
+
+def _scope(stage: Stage, epoch: str) -> str:
+    """The folder of an epoch's own stages, or that of stages of the reference: no epoch may have its name."""
+    return "reference" if stage.of_reference else epoch
+
+
+def _components(stage: Stage, config: Config) -> str:
+    """What else than configuration and inputs decides the result: versions of the components that a stage uses."""
+    versions = {
+        "features": lambda: features.extractor_version(config.features),
+        "index": lambda: index.descriptor_version(config),
+        "localize": lambda: localize.matcher_version(config),
+    }
+    return versions[stage.name]() if stage.name in versions else ""
 
 
 def _run_stage(stage: Stage, context: StageContext, parts: dict[str, Any]) -> StageResult:
@@ -177,7 +202,7 @@ def _state_of(project: Project, epoch: str, stage: Stage, folder: Path, parts: d
         return StageState(
             stage.name, "partial", f"interrupted; {items} items are kept" if items else "interrupted", folder
         )
-    older = [p for p in project.stage_history(epoch, stage.name) if (p / BEGUN).is_file()]
+    older = [p for p in project.stage_history(_scope(stage, epoch), stage.name) if (p / BEGUN).is_file()]
     if not older:
         return StageState(stage.name, "new", "", folder)
     before = _read_json(older[-1] / BEGUN) or {}
@@ -209,6 +234,10 @@ def _plain(value: Any) -> Any:
     if isinstance(value, (tuple, list)):
         return [_plain(v) for v in value]
     return value
+
+
+def _states_of(*campaigns: Campaign) -> str:
+    return _hash([_state(image.path) for campaign in campaigns for image in campaign.images])
 
 
 def _state(path: Path) -> list[Any]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -64,3 +65,9 @@ def extractor_version(config: FeaturesConfig) -> str:
     """What decides the features beside the image: the component, its weights and settings, level and budget."""
     version = load_component(EXTRACTORS, config.extractor).version()
     return f"{version}; longest side {config.longest_side_px}; at most {config.max_keypoints}"
+
+
+def failed_images(folder: Path) -> dict[str, tuple[str, str]]:
+    """Images without usable features, by key in the feature store: reason and detail, of a finished stage."""
+    data = json.loads((folder / "stage.json").read_text(encoding="utf-8"))
+    return {key: (reason, detail) for key, (reason, detail) in data["data"]["failed"].items()}

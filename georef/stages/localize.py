@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import logging
 from collections import Counter
 from dataclasses import dataclass
@@ -16,9 +15,12 @@ from georef.errors import ConfigError, StageError
 from georef.estimation.localization import localize_image
 from georef.estimation.reference_map import ReferenceMap
 from georef.features.base import Matcher
+from georef.features.images import UnreadableImage
 from georef.features.registry import MATCHERS, load_component
 from georef.io.items import item_ids, item_path, read_outcome, write_outcome
 from georef.stages.base import StageContext, StageSummary, feature_id, open_features
+from georef.stages.features import failed_images
+from georef.stages.index import SimilarImages, open_index
 from georef.stages.network import read_noise
 from georef.types.campaign import Campaign, Image
 from georef.types.features import Features
@@ -37,6 +39,13 @@ class LocalizeTask:
     store_folder: Path
     config: Config
     failed: dict[str, tuple[str, str]]
+    index_folder: Path
+
+    @cached_property
+    def similar(self) -> SimilarImages | None:
+        if self.config.candidates.ranking == "votes":
+            return None
+        return open_index(self.index_folder, self.store_folder, self.config, self.map.images)
 
     @cached_property
     def map(self) -> ReferenceMap:
@@ -57,6 +66,7 @@ class LocalizeTask:
             return Rejected(image.image_id, RejectReason(failure[0]), failure[1])
         try:
             features = open_features(self.store_folder).read(feature_id(image))
+            similar = None if self.similar is None else self.similar.to_image(image, features)
             return localize_image(
                 image,
                 features,
@@ -65,7 +75,10 @@ class LocalizeTask:
                 self.config.candidates,
                 self.config.localize,
                 self.config.matching.max_keypoints,
+                similar,
             )
+        except UnreadableImage as error:
+            return Rejected(image.image_id, RejectReason.UNREADABLE, error.problem)
         except (ArithmeticError, ValueError, IndexError, np.linalg.LinAlgError) as error:
             logger.exception("localization of %s failed", image.image_id)
             return Rejected(image.image_id, RejectReason.INTERNAL, f"{type(error).__name__}: {error}")
@@ -86,12 +99,15 @@ def run(context: StageContext) -> StageSummary:
 
 def make_task(context: StageContext) -> LocalizeTask:
     noise, suspects = read_noise(context.before["network"])
-    failed = _failed(context.before["features"])
+    failed = failed_images(context.before["features"])
     reference = context.survey.reference
     usable = tuple(i for i in reference.images if i.image_id not in suspects and feature_id(i) not in failed)
     if len(usable) < 2:
         raise StageError(f"Only {len(usable)} reference images can be used, at least two are needed.")
-    return LocalizeTask(Campaign(reference.epoch, usable), noise, context.before["store"], context.config, failed)
+    folders = context.before
+    return LocalizeTask(
+        Campaign(reference.epoch, usable), noise, folders["store"], context.config, failed, folders["index"]
+    )
 
 
 def outcomes_exist(context: StageContext) -> bool:
@@ -103,11 +119,6 @@ def outcomes_exist(context: StageContext) -> bool:
 def read_outcomes(folder: Path, epoch: Campaign) -> list[Outcome]:
     """The outcomes of all images of an epoch, in its order."""
     return [read_outcome(item_path(folder / ITEMS, image.image_id)) for image in epoch.images]
-
-
-def _failed(features_folder: Path) -> dict[str, tuple[str, str]]:
-    data = json.loads((features_folder / "stage.json").read_text(encoding="utf-8"))
-    return {key: (reason, detail) for key, (reason, detail) in data["data"]["failed"].items()}
 
 
 def _summary(outcomes: list[Outcome], computed: int) -> StageSummary:
@@ -123,10 +134,8 @@ def _summary(outcomes: list[Outcome], computed: int) -> StageSummary:
     return StageSummary(line, {"localized": len(localized), "rejected": dict(rejected)}, computed, len(outcomes))
 
 
-def components(config: Config, stage: str) -> str:
-    """What else than configuration and inputs decides the result: the matcher's version, for this stage alone."""
-    if stage != "localize":
-        return ""
+def matcher_version(config: Config) -> str:
+    """The matcher's version. Raises ConfigError where it does not fit the features."""
     matcher = load_component(MATCHERS, config.matching.matcher, **config.matching.options)
     fitting = getattr(matcher, "extractors", None)  # None: any
     if fitting is not None and config.features.extractor not in fitting:

@@ -29,7 +29,7 @@ def test_castle_without_surveyed_control(georef_data: Path, tmp_path: Path) -> N
         pytest.skip(f"weights: {error}")
     project = open_project(_PROJECT, data=georef_data, output=tmp_path)
     results = list(run_pipeline(project, "new_epoch", Executor(threads=2)))
-    assert [result.stage for result in results] == ["features", "network", "localize", "adjust", "report"]
+    assert [result.stage for result in results] == ["features", "network", "index", "localize", "adjust", "report"]
     published = tmp_path / "epochs" / "new_epoch"
     report = json.loads((published / "report.json").read_text())
     assert report["images"]["localized"] == report["images"]["total"] == 9

@@ -106,7 +106,7 @@ def test_status_of_a_new_project(tiny_tables: Path, capsys: pytest.CaptureFixtur
     lines = capsys.readouterr().out.splitlines()
     assert lines[0].startswith(f"project tiny, epoch {EPOCH}, results in ")
     assert [line.split() for line in lines[4:]] == [
-        [name, "new"] for name in ("features", "network", "localize", "adjust", "report")
+        [name, "new"] for name in ("features", "network", "index", "localize", "adjust", "report")
     ]
 
 

@@ -16,7 +16,7 @@ from georef.terminal import exit_code
 from tests.stages.bench import Bench
 from tests.worlds.tiny import EPOCH, TinyWorld
 
-STAGES = ["features", "network", "localize", "adjust", "report"]
+STAGES = ["features", "network", "index", "localize", "adjust", "report"]
 
 
 def test_all_images_come_out_right(finished: Bench, tiny_world: TinyWorld) -> None:
@@ -39,6 +39,7 @@ def test_a_second_run_computes_nothing(finished: Bench) -> None:
     assert {name: r.summary.total for name, r in results.items()} == {
         "features": 11,
         "network": 8,
+        "index": 8,
         "localize": 3,
         "adjust": 3,
         "report": 1,
@@ -76,6 +77,7 @@ def test_a_changed_setting_makes_stale_what_depends_on_it(copied: Callable[..., 
     assert {name: s.state for name, s in states.items()} == {
         "features": "done",
         "network": "stale",
+        "index": "done",
         "localize": "stale",
         "adjust": "stale",
         "report": "stale",

@@ -1,0 +1,164 @@
+"""Stage `index`: global descriptors of all reference images, into the vector database."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property, partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from georef.config import CandidatesConfig, Config, RetrievalConfig
+from georef.estimation.candidates import Box
+from georef.estimation.search import FindSimilar
+from georef.features.globals.base import GlobalDescriptor, Needs, Row
+from georef.features.globals.state import LearnedState
+from georef.features.images import UnreadableImage, read_image
+from georef.features.registry import GLOBAL_DESCRIPTORS, load_component
+from georef.stages.base import StageContext, StageSummary, feature_id, open_features
+from georef.stages.features import failed_images
+from georef.store.vector_index import IndexRow, VectorIndex
+from georef.types.campaign import Image
+from georef.types.features import Features
+
+STATE, VECTORS = "descriptor.safetensors", "vectors"
+_LEARNED_FROM = 2000  # images, evenly chosen: more teach little, and learning goes through them twice
+logger = logging.getLogger(__name__)
+
+
+def run(context: StageContext) -> StageSummary:
+    """Learns the global descriptor where it must be learned, and describes what is not yet in the database."""
+    if context.config.candidates.ranking == "votes":
+        return StageSummary("not needed: references are ranked by votes")
+    failed = failed_images(context.before["features"])
+    images = [image for image in context.survey.reference.images if feature_id(image) not in failed]
+    task = DescribeTask(context.config.retrieval, context.before["store"], context.folder / STATE)
+    task.learn(images)
+    vectors = open_vectors(context.folder, task.descriptor)
+    there = vectors.keys()
+    pending = [image for image in images if feature_id(image) not in there]
+    vectors.upsert(_rows(pending, context.executor.map_items(task, pending, "index")))
+    vectors.optimize()
+    line = f"{len(vectors)} of {len(images)} reference images in the vector database, by {task.config.descriptor}"
+    return StageSummary(line, {"indexed": len(vectors)}, len(pending), len(images))
+
+
+def descriptor_version(config: Config) -> str:
+    """What decides the descriptors beside the images and what is learned from them; "" where votes rank alone."""
+    return "" if config.candidates.ranking == "votes" else _made(config.retrieval).version()
+
+
+def open_vectors(folder: Path, descriptor: GlobalDescriptor) -> VectorIndex:
+    """The vector database of a stage's folder."""
+    return VectorIndex(folder / VECTORS, version=descriptor.version(), size=descriptor.size)
+
+
+@dataclass
+class DescribeTask:
+    """Describes one image; None where it can no longer be read."""
+
+    config: RetrievalConfig
+    store_folder: Path
+    state_path: Path
+
+    @cached_property
+    def descriptor(self) -> GlobalDescriptor:
+        made = _made(self.config)
+        return made.with_state(LearnedState.load(self.state_path)) if _learns(made) else made
+
+    def learn(self, images: Sequence[Image]) -> None:
+        """Learns from reference images, unless that was done or there is nothing to learn."""
+        made = _made(self.config)
+        if _learns(made) and not self.state_path.is_file():
+            step = max(1, len(images) // _LEARNED_FROM)
+            made.learn(_Contents(made.needs, images[::step], self.store_folder)).save(self.state_path)
+
+    def __call__(self, image: Image) -> Row | None:
+        for content in _Contents(self.descriptor.needs, [image], self.store_folder):
+            return self.describe(content)
+        return None
+
+    def describe(self, content: Any) -> Row:
+        """The row of an image's pixels or features, whichever the descriptor needs."""
+        return self.descriptor.describe(*((content, None) if self.descriptor.needs == "pixels" else (None, content)))
+
+
+@dataclass(frozen=True)
+class _Contents:
+    """What a descriptor looks at in each image, read as it is gone through; what cannot be read is left out."""
+
+    needs: Needs
+    images: Sequence[Image]
+    store_folder: Path
+
+    def __iter__(self) -> Iterator[Any]:
+        for image in self.images:
+            try:
+                if self.needs == "pixels":
+                    yield read_image(image.path)
+                else:
+                    yield open_features(self.store_folder).read(feature_id(image))
+            except UnreadableImage as error:
+                logger.warning("%s cannot be described: %s", image.image_id, error.problem)
+
+
+@dataclass(frozen=True, eq=False)
+class SimilarImages:
+    """Finds the references of a map in the vector database that look most like a new image."""
+
+    task: DescribeTask
+    vectors: VectorIndex
+    row_of: Mapping[str, int]  # index into the reference map, by key in the database
+
+    def to_image(self, image: Image, features: Features) -> FindSimilar:
+        """The search for one image. Raises UnreadableImage."""
+        needs_pixels = self.task.descriptor.needs == "pixels"
+        return partial(self._nearest, self.task.describe(read_image(image.path) if needs_pixels else features))
+
+    def _nearest(
+        self, row: Row, count: int, box: Box, heading_rad: float | None, config: CandidatesConfig
+    ) -> NDArray[np.int64]:
+        """Asks for more where what comes is not in the map: references that were set aside since."""
+        asked = count
+        while True:
+            found = self.vectors.nearest(
+                row,
+                asked,
+                centre=box.centre,
+                half_side_m=box.half_side_m,
+                heading_rad=heading_rad,
+                heading_window_deg=None if heading_rad is None else config.heading_window_deg,
+                epochs=config.epochs or None,
+            )
+            known = [self.row_of[key] for key in found.keys if key in self.row_of]
+            if len(known) >= count or len(found.keys) < asked:
+                return np.array(known[:count], np.int64)
+            asked *= 2
+
+
+def open_index(folder: Path, store_folder: Path, config: Config, references: Iterable[Image]) -> SimilarImages:
+    """The vector database of a finished stage, for the references of a map in their order."""
+    task = DescribeTask(config.retrieval, store_folder, folder / STATE)
+    rows = {feature_id(image): row for row, image in enumerate(references)}
+    return SimilarImages(task, open_vectors(folder, task.descriptor), rows)
+
+
+def _rows(images: Sequence[Image], described: Iterable[Row | None]) -> Iterator[IndexRow]:
+    for image, row in zip(images, described, strict=True):
+        pose = image.world_from_cam
+        if row is not None and pose is not None:
+            forward = pose.rotation[:, 2]
+            heading = float(np.arctan2(forward[0], forward[1]))
+            yield IndexRow(feature_id(image), pose.translation, heading, image.epoch, image.camera.camera_id, row)
+
+
+def _made(config: RetrievalConfig) -> Any:
+    return load_component(GLOBAL_DESCRIPTORS, config.descriptor, **config.options)
+
+
+def _learns(descriptor: GlobalDescriptor) -> bool:
+    return hasattr(descriptor, "learn")
