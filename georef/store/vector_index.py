@@ -2,7 +2,8 @@
 
 A table of LanceDB in one folder: written in batches that are there as a whole or not at all, whatever kills the
 writer; readers see the last complete state. Writers take turns by a lock file. This is the only module that imports
-lancedb (2 s, 150 MB), and it does so when a table is first opened. Its threads do not survive fork: start workers by spawn.
+lancedb (2 s, 150 MB), and it does so when a table is first opened. Its threads do not survive a fork: start workers by
+spawn.
 """
 
 from __future__ import annotations
@@ -67,8 +68,8 @@ class VectorIndex:
         """Insert rows, or replace those whose key is there already; returns how many were given.
 
         Rows are taken and committed batch by batch (32 MB of descriptors): memory does not grow with their number, and
-        what was committed before an error or the end of the process stays. Of rows with the same key the last one counts.
-        Raises ValueError for a row that cannot be stored, with its key.
+        what was committed before an error or the end of the process stays. Of rows with the same key the last one
+        counts. Raises ValueError for a row that cannot be stored, with its key.
         """
         remaining, count = iter(rows), 0
         most = max(1, min(_MOST_ROWS, _BATCH_BYTES // (4 * self._size)))
