@@ -67,10 +67,10 @@ def _answered(city: City, folders: dict[str, Path], name: str, searches: list[wa
 
 def _inside(positions: NDArray[np.float64], searches: list[ways.Search]) -> int:
     """How many images are in the box, before the heading window; the median."""
-    if searches[0].centre is None:
+    boxes = [(s.centre, s.half_side_m) for s in searches[:20] if s.centre is not None]
+    if not boxes:
         return len(positions)
-    boxes = [(np.abs(positions[:, :2] - s.centre).max(axis=1) <= s.half_side_m).sum() for s in searches[:20]]
-    return int(np.median(boxes))
+    return int(np.median([(np.abs(positions[:, :2] - at).max(axis=1) <= half).sum() for at, half in boxes]))
 
 
 def _filling(cost: Cost[dict[str, float]]) -> dict[str, float]:

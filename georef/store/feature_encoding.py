@@ -36,7 +36,7 @@ def encode(features: Features, quantize: bool) -> tuple[Arrays, dict[str, str]]:
 
     Raises ValueError for descriptors that are not finite where they would be quantized.
     """
-    descriptors = np.ascontiguousarray(features.descriptors)
+    descriptors: np.ndarray = np.ascontiguousarray(features.descriptors)
     arrays = {
         "keypoints_px": np.ascontiguousarray(features.keypoints_px, np.float32),
         "colors_rgb": np.ascontiguousarray(features.colors_rgb, np.uint8),

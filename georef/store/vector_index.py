@@ -16,7 +16,7 @@ from datetime import timedelta
 from functools import partial
 from itertools import islice
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -24,9 +24,6 @@ from numpy.typing import ArrayLike, NDArray
 from georef.errors import StageError
 from georef.store.vector_filter import condition, one_of
 from georef.store.vector_rows import IndexRow, batch_of, schema_of, schema_problem
-
-if TYPE_CHECKING:
-    from lancedb.table import Table
 
 _TABLE = "images"
 _BATCH_BYTES = 32 * 2**20  # of descriptors, written and committed together
@@ -59,7 +56,7 @@ class VectorIndex:
 
     def __init__(self, folder: Path, *, version: str, size: int) -> None:
         self._folder, self._version, self._size = folder, version, size
-        self._opened: Table | None = None
+        self._opened: Any = None
 
     def __getstate__(self) -> dict[str, Any]:
         return self.__dict__ | {"_opened": None}
@@ -124,7 +121,7 @@ class VectorIndex:
         where = condition(centre, half_side_m, heading_rad, heading_window_deg, epochs)
         if k <= 0 or not self._exists():
             return Neighbours((), np.zeros(0, np.float32))
-        search: Any = self._table().search(query, vector_column_name="descriptor").distance_type("l2")
+        search = self._table().search(query, vector_column_name="descriptor").distance_type("l2")
         if where is None:
             search = search.nprobes(_PROBES).refine_factor(_REFINE)
         else:
@@ -169,13 +166,13 @@ class VectorIndex:
             fcntl.flock(lock, fcntl.LOCK_EX)
             yield
 
-    def _table(self) -> Table:
+    def _table(self) -> Any:
         """The table, made where there is none; each use of it sees the latest state."""
         if self._opened is None:
             self._opened = self._open()
         return self._opened
 
-    def _open(self) -> Table:
+    def _open(self) -> Any:
         import lancedb
 
         remedy = f"Delete the folder and index the images again.\nIn {self._folder}"

@@ -11,6 +11,7 @@ import time
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -56,9 +57,9 @@ def filled(tmp_path_factory: pytest.TempPathFactory) -> tuple[VectorIndex, list[
     return index, rows
 
 
-def _by_hand(rows: list[IndexRow], query: np.ndarray, k: int, **filters) -> list[tuple[float, str]]:
+def _by_hand(rows: list[IndexRow], query: np.ndarray, k: int, **filters: Any) -> list[tuple[float, str]]:
     centre, half = filters.get("centre"), filters.get("half_side_m")
-    heading, window, epochs = (filters.get(name) for name in ("heading_rad", "heading_window_deg", "epochs"))
+    heading, window, epochs = filters.get("heading_rad"), filters.get("heading_window_deg", 180), filters.get("epochs")
 
     def passes(row: IndexRow) -> bool:
         if centre is not None and np.abs(row.position_in_world[:2] - centre[:2]).max() > half:
@@ -178,10 +179,16 @@ def test_a_damaged_index_says_what_to_do(tmp_path: Path) -> None:
     ],
 )
 def test_rows_that_cannot_be_stored_are_named(tmp_path: Path, change: dict, message: str) -> None:
-    given = {"key": "k", "position_in_world": np.zeros(3), "heading_rad": None, "epoch": "e", "camera": "c"}
+    given: dict[str, Any] = {
+        "key": "k",
+        "position_in_world": np.zeros(3),
+        "heading_rad": None,
+        "epoch": "e",
+        "camera": "c",
+    }
     index = _open(tmp_path)
     with pytest.raises(ValueError, match=message):
-        index.upsert([IndexRow(**({"descriptor": np.ones(SIZE, np.float32)} | given | change))])
+        index.upsert([IndexRow(**{"descriptor": np.ones(SIZE, np.float32), **given, **change})])
     assert len(index) == 0
 
 
@@ -197,7 +204,7 @@ def test_rows_that_cannot_be_stored_are_named(tmp_path: Path, change: dict, mess
         (None, None, math.inf, 9),
     ],
 )
-def test_half_a_filter_is_refused(arguments: tuple) -> None:
+def test_half_a_filter_is_refused(arguments: tuple[Any, Any, Any, Any]) -> None:
     with pytest.raises(ValueError, match=r"needs|is no"):
         condition(*arguments, None)
 
