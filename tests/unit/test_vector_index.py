@@ -294,7 +294,7 @@ def _check_acknowledged(folder: Path, prefixes: list[str], *, live: bool = True)
 
 
 def _wait(condition, process) -> None:
-    end = time.monotonic() + 60
+    end = time.monotonic() + 300  # a loaded machine may take long to start a process
     while not condition():
         assert time.monotonic() < end
         assert process.is_alive()
