@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from cyclopts import App, Parameter
 
 from georef import __version__
+from georef.cli_benchmark import benchmark
 from georef.cli_weights import weights
 from georef.terminal import exit_code, say
 
@@ -32,6 +33,7 @@ app = App(
     suppress_keyboard_interrupt=False,
 )
 app.command(weights)
+app.command(benchmark)
 
 _REPEATED: Any = {"consume_multiple": False, "negative": (), "show_default": False}
 ProjectArgument = Annotated[Path, Parameter(help="Project folder, or its project.toml.")]

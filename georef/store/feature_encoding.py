@@ -6,8 +6,9 @@
 | colors_rgb (N, 3) | uint8 | uint8 |
 | scores (N,) | float32 | float16 where all fit into it |
 | scales_px | as below | as below |
-| descriptors (N, D) | as they came | uint8 as they came; others as descriptor_codes (N, B) uint8, descriptor_factors (N,) |
+| descriptors (N, D) | as they came | uint8 as they came; others as descriptor_codes, descriptor_factors |
 
+`quantization` says what codes (N, B) uint8 and factors (N,) float32 are.
 Scales are exact in both: detectors that work in a few levels have few, and then scale_values (K,) holds the different
 ones and scale_codes (N,) uint8 says which (left out where there is one); with more than 256, scales_px (N,) float32.
 """
@@ -35,7 +36,7 @@ def encode(features: Features, quantize: bool) -> tuple[Arrays, dict[str, str]]:
 
     Raises ValueError for descriptors that are not finite where they would be quantized.
     """
-    descriptors = np.ascontiguousarray(features.descriptors)
+    descriptors: np.ndarray = np.ascontiguousarray(features.descriptors)
     arrays = {
         "keypoints_px": np.ascontiguousarray(features.keypoints_px, np.float32),
         "colors_rgb": np.ascontiguousarray(features.colors_rgb, np.uint8),

@@ -27,7 +27,7 @@ def pack_rows(rows: NDArray[np.floating]) -> tuple[NDArray[np.uint8], NDArray[np
     if not np.isfinite(values).all():
         raise ValueError("descriptors with values that are not finite cannot be stored")
     largest = np.abs(values).max(axis=1, initial=0.0, keepdims=True)
-    codes = np.rint(values * (_TOP / np.maximum(largest, np.finfo(np.float32).tiny)))
+    codes = np.rint(_TOP * np.divide(values, largest, out=np.zeros_like(values), where=largest > 0))
     lengths = np.linalg.norm(values, axis=1), np.linalg.norm(codes, axis=1)
     factors = np.divide(*lengths, out=np.zeros(len(values), np.float32), where=lengths[1] > 0)
     return _pack(codes), factors
@@ -56,21 +56,22 @@ def _groups(size: int) -> int:
 
 def _pack(codes: NDArray[np.float32]) -> NDArray[np.uint8]:
     count, size = codes.shape
-    unsigned = np.zeros((count, 8, _groups(size)), np.uint8)
-    unsigned.reshape(count, -1)[:, :size] = codes + (_TOP + 1)
+    groups = _groups(size)
+    unsigned = np.zeros((count, 8, groups), np.uint8)
+    unsigned.reshape(count, 8 * groups)[:, :size] = codes + (_TOP + 1)
     packed, last = unsigned[:, :BITS], unsigned[:, BITS]
     for bit in range(BITS):
         packed[:, bit] |= ((last >> bit) & 1) << BITS
-    return np.ascontiguousarray(packed.reshape(count, -1))  # the view has gaps
+    return np.ascontiguousarray(packed.reshape(count, BITS * groups))  # the view has gaps
 
 
 def _unpack(packed: NDArray[np.uint8]) -> NDArray[np.int8]:
     count, width = packed.shape
     codes = np.empty((count, 8, width // BITS), np.uint8)
-    bytes_ = packed.reshape(count, BITS, -1)
+    bytes_ = packed.reshape(count, BITS, width // BITS)
     np.bitwise_and(bytes_, _LOW, out=codes[:, :BITS])
     last = codes[:, BITS]
     last[:] = bytes_[:, 0] >> BITS
     for bit in range(1, BITS):
         last |= (bytes_[:, bit] >> BITS) << bit
-    return codes.reshape(count, -1).view(np.int8) - np.int8(_TOP + 1)
+    return codes.reshape(count, 8 * (width // BITS)).view(np.int8) - np.int8(_TOP + 1)

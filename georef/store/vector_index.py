@@ -2,7 +2,8 @@
 
 A table of LanceDB in one folder: written in batches that are there as a whole or not at all, whatever kills the
 writer; readers see the last complete state. Writers take turns by a lock file. This is the only module that imports
-lancedb (2 s, 150 MB), and it does so when a table is first opened. Its threads do not survive fork: start workers by spawn.
+lancedb (2 s, 150 MB), and it does so when a table is first opened. Its threads do not survive a fork: start workers by
+spawn.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from datetime import timedelta
 from functools import partial
 from itertools import islice
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -23,9 +24,6 @@ from numpy.typing import ArrayLike, NDArray
 from georef.errors import StageError
 from georef.store.vector_filter import condition, one_of
 from georef.store.vector_rows import IndexRow, batch_of, schema_of, schema_problem
-
-if TYPE_CHECKING:
-    from lancedb.table import Table
 
 _TABLE = "images"
 _BATCH_BYTES = 32 * 2**20  # of descriptors, written and committed together
@@ -58,7 +56,7 @@ class VectorIndex:
 
     def __init__(self, folder: Path, *, version: str, size: int) -> None:
         self._folder, self._version, self._size = folder, version, size
-        self._opened: Table | None = None
+        self._opened: Any = None
 
     def __getstate__(self) -> dict[str, Any]:
         return self.__dict__ | {"_opened": None}
@@ -67,8 +65,8 @@ class VectorIndex:
         """Insert rows, or replace those whose key is there already; returns how many were given.
 
         Rows are taken and committed batch by batch (32 MB of descriptors): memory does not grow with their number, and
-        what was committed before an error or the end of the process stays. Of rows with the same key the last one counts.
-        Raises ValueError for a row that cannot be stored, with its key.
+        what was committed before an error or the end of the process stays. Of rows with the same key the last one
+        counts. Raises ValueError for a row that cannot be stored, with its key.
         """
         remaining, count = iter(rows), 0
         most = max(1, min(_MOST_ROWS, _BATCH_BYTES // (4 * self._size)))
@@ -123,7 +121,7 @@ class VectorIndex:
         where = condition(centre, half_side_m, heading_rad, heading_window_deg, epochs)
         if k <= 0 or not self._exists():
             return Neighbours((), np.zeros(0, np.float32))
-        search: Any = self._table().search(query, vector_column_name="descriptor").distance_type("l2")
+        search = self._table().search(query, vector_column_name="descriptor").distance_type("l2")
         if where is None:
             search = search.nprobes(_PROBES).refine_factor(_REFINE)
         else:
@@ -168,13 +166,13 @@ class VectorIndex:
             fcntl.flock(lock, fcntl.LOCK_EX)
             yield
 
-    def _table(self) -> Table:
+    def _table(self) -> Any:
         """The table, made where there is none; each use of it sees the latest state."""
         if self._opened is None:
             self._opened = self._open()
         return self._opened
 
-    def _open(self) -> Table:
+    def _open(self) -> Any:
         import lancedb
 
         remedy = f"Delete the folder and index the images again.\nIn {self._folder}"

@@ -35,6 +35,9 @@ VERBS = [
     "weights",
     "weights list",
     "weights fetch",
+    "benchmark",
+    "benchmark vectors",
+    "benchmark features",
 ]
 GEOREF = [sys.executable, "-c", "from georef.cli import main; main()"]
 POSES = "# CRS: EPSG:25832, height: ellipsoidal, metres.\nimage,easting,northing,height,omega,phi,kappa\n"

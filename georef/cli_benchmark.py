@@ -1,0 +1,68 @@
+"""The verbs `benchmark vectors` and `benchmark features`."""
+
+from __future__ import annotations
+
+import json
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated, Any
+
+from cyclopts import App, Parameter, validators
+
+from georef.terminal import say
+
+benchmark = App(name="benchmark", help="Measure the stores at the size of a city on this machine; takes minutes.")
+
+Scratch = Annotated[Path | None, Parameter(help="Where to put gigabytes while measuring; else the system's own place.")]
+Output = Annotated[Path | None, Parameter(name=["--output", "-o"], help="JSON file with all figures.")]
+Count = Annotated[int, Parameter(validator=validators.Number(gte=1))]
+
+
+@benchmark.command
+def vectors(
+    *,
+    rows: Annotated[Count, Parameter(help="Images in the index.")] = 1_000_000,
+    size: Annotated[Count, Parameter(help="Values of a descriptor.")] = 512,
+    queries: Annotated[Count, Parameter(help="Searches of each kind.")] = 100,
+    scratch: Scratch = None,
+    output: Output = None,
+) -> int:
+    """The vector index against brute force: writing, searches by box, recall, memory, disk; 8 GB of scratch."""
+    from georef.benchmarks import vectors as bench
+
+    return _measure(lambda folder: bench.run(rows, size, queries, folder), bench.describe, scratch, output)
+
+
+@benchmark.command
+def features(
+    *,
+    images: Annotated[Count, Parameter(help="Images in the store.")] = 2000,
+    keypoints: Annotated[Count, Parameter(help="Features of each.")] = 6144,
+    scratch: Scratch = None,
+    output: Output = None,
+) -> int:
+    """The feature store against exact storage and numpy's archives: rates, memory, disk; 18 GB of scratch."""
+    from georef.benchmarks import features as bench
+
+    return _measure(lambda folder: bench.run(images, keypoints, folder), bench.describe, scratch, output)
+
+
+def _measure(
+    run: Callable[[Path], dict[str, Any]],
+    describe: Callable[[dict[str, Any]], list[str]],
+    scratch: Path | None,
+    output: Path | None,
+) -> int:
+    """Measures in a folder of its own, which is gone afterwards."""
+    from georef.io.files import write_text_atomically
+
+    if scratch is not None:
+        scratch.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(prefix="georef-benchmark-", dir=scratch) as folder:
+        result = run(Path(folder))
+    say(*describe(result))
+    if output is not None:
+        write_text_atomically(json.dumps(result, indent=1) + "\n", output)
+        say(f"written     {output}")
+    return 0
