@@ -191,7 +191,10 @@ def project_toml(world: EvaluationWorld, ending: str = "") -> str:
     return "\n".join(sections)
 
 
-_PANORAMA = f'projection = "{{projection}}"\nheads = "{HEADS}"\nstitching_radius_m = {STITCHING_RADIUS_M}\n'
+_PANORAMA = (
+    f'panorama = {{{{ projection = "{{projection}}", heads = "{HEADS}", '
+    f"stitching_radius_m = {STITCHING_RADIUS_M} }}}}\n"
+)
 _UNKNOWN = 'intrinsics = ["focal", "k1"]     # unknown; the estimation starts from the focal length in EXIF\n'
 _HEADER = f"""\
 # A simulated street for evaluations: two reference epochs, mapped by three cameras and by panoramas, and new images of
