@@ -42,7 +42,7 @@ class Stage:
 def _reference_files(project: Project, survey: Survey) -> dict[str, Any]:
     return {
         "crs": project.file.crs.model_dump(),
-        "reference": project.file.reference.model_dump(),
+        "reference": {name: section.model_dump() for name, section in project.file.reference_epochs.items()},
         "reference tables": _digest(survey.reference),
     }
 
@@ -52,7 +52,8 @@ def _epoch_files(project: Project, survey: Survey) -> dict[str, Any]:
 
 
 def _all_images(project: Project, survey: Survey) -> dict[str, Any]:
-    states = [_state(image.path) for campaign in (survey.reference, survey.epoch) for image in campaign.images]
+    images = [*survey.reference.images, *survey.epoch.images]
+    states = [_state(survey.source_of(image)) for image in images]
     return {"images": _hash(states)}
 
 

@@ -103,7 +103,7 @@ class EpochSection(Section):
     @field_validator("intrinsics")
     @classmethod
     def _possible(cls, value: Any) -> Any:
-        if isinstance(value, tuple) and ("k2" in value and "k1" not in value or len(set(value)) < len(value)):
+        if isinstance(value, tuple) and (len(set(value)) < len(value) or {"k1", "k2"} & set(value) == {"k2"}):
             raise ValueError('each of "focal", "k1", "k2" at most once, and k2 only together with k1')
         return value
 

@@ -43,7 +43,7 @@ def _cut(source: _Equirectangular | _CubeMap, head: PanoramaHead) -> Rgb:
     out = np.empty((camera.height, camera.width, 3), np.uint8)
     for first in range(0, camera.height, _ROWS):
         rows = min(_ROWS, camera.height - first)
-        pixels = pixel_grid(camera.width, rows, samples) + [0.0, first]
+        pixels = pixel_grid(camera.width, rows, samples) + np.array([0.0, first])
         fine = source.sample(directions_from_head(head, pixels))
         out[first : first + rows] = _averaged(fine, samples)
     return out

@@ -52,7 +52,7 @@ def read_exterior_orientation(
     columns: Mapping[str, str] | None = None,
     table_format: TableFormat | None = None,
 ) -> ExteriorOrientationTable:
-    """Read image, position, angles, optionally fx, fy, cx, cy (px), camera, sigmas of position (m) and angles (`angle_unit`).
+    """Read image, position, angles, optionally fx, fy, cx, cy (px), camera, sigmas of position (m) and of the angles.
 
     The convention and the unit of the angles are asked for, never guessed. Raises InputError for columns that are
     missing, values that cannot be, images listed twice, and comments that declare other angles than asked for.

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from georef.geometry.panorama import RIG_FROM_PANO
 from georef.geometry.angles import yaw_pitch_roll_from_rotation
+from georef.geometry.panorama import RIG_FROM_PANO, PanoramaHead
 from georef.geometry.rigid import Rigid3
 from georef.io.files import write_text_atomically
 from georef.simulate import tables
@@ -144,7 +144,8 @@ def _write_positions(world: EvaluationWorld, epoch: str, files: Sequence[Product
     source = "vehicle" if epoch == UNDISTORTED else epoch  # the same photographs have the same positions
     for ending, system in PRIORS.items():
         positions, headings = drawn_positions(world, list(poses.values()), system, source + ending)
-        text = tables.position_table(dict(zip(poses, positions, strict=True)), system.sigmas_m, headings, cameras, world.frame)
+        placed = dict(zip(poses, positions, strict=True))
+        text = tables.position_table(placed, system.sigmas_m, headings, cameras, world.frame)
         write_text_atomically(text, folder / f"{epoch}_gnss{ending}.csv")
 
 
@@ -159,7 +160,7 @@ def _write_truth(world: EvaluationWorld, epoch: str, files: Sequence[Product], t
     write_text_atomically(tables.orientation_table(moved, {}, world.frame), truth / f"{epoch}_eo_relative.csv")
 
 
-def _head_table(heads: Sequence) -> str:
+def _head_table(heads: Sequence[PanoramaHead]) -> str:
     rows = []
     for head in heads:
         c, pose = head.camera, head.pano_from_head
@@ -196,7 +197,7 @@ _PANORAMA = (
     f"stitching_radius_m = {STITCHING_RADIUS_M} }}}}\n"
 )
 _UNKNOWN = 'intrinsics = ["focal", "k1"]     # unknown; the estimation starts from the focal length in EXIF\n'
-_HEADER = f"""\
+_HEADER = """\
 # A simulated street for evaluations: two reference epochs, mapped by three cameras and by panoramas, and new images of
 # many kinds. Positions are good to 15 m; tables that end in _100m.csv hold weaker ones:
 # --set epochs.vehicle.gnss=vehicle_gnss_100m.csv

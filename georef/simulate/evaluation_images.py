@@ -213,5 +213,3 @@ def _jpeg(pixels: Rgb, focal_35mm: int | None) -> bytes:
         exif.get_ifd(_EXIF_SECTION)[_FOCAL_35MM] = focal_35mm
     PillowImage.fromarray(pixels).save(buffer, "JPEG", quality=_JPEG_QUALITY, exif=exif)
     return buffer.getvalue()
-
-
