@@ -43,12 +43,17 @@ def read_heads(
     return tuple(
         PanoramaHead(
             name,
-            Camera(name, int(sizes[i, 0]), int(sizes[i, 1]), *map(float, interior[i])),
+            _pinhole(name, sizes[i], interior[i]),
             head_pose(angles[i], positions[i]),
             np.inf if stitching_radius_m is None else stitching_radius_m,
         )
         for i, name in enumerate(names)
     )
+
+
+def _pinhole(name: str, size: np.ndarray, interior: np.ndarray) -> Camera:
+    fx, fy, cx, cy = (float(v) for v in interior)
+    return Camera(name, int(size[0]), int(size[1]), fx, fy, cx, cy)
 
 
 def _optional(table: Table, name: str) -> np.ndarray:
