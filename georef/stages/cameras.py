@@ -11,6 +11,8 @@ from georef.geometry.camera import Camera
 from georef.io.camera_table import DEFAULT_FOCAL, read_cameras
 from georef.io.exif import image_size, size_and_focal
 
+_UNREADABLE = (65536, 65536)  # no mark is outside of it
+
 
 @dataclass(frozen=True)
 class Stated:
@@ -91,12 +93,12 @@ def require_known(camera: Camera, path: Path) -> Camera:
 def unknown_camera(path: Path, unknown: tuple[str, ...]) -> Camera:
     """A camera of which only the picture is known: it starts from the focal length of EXIF, or from the usual one.
 
-    A file that cannot be read gets a camera of one pixel; the image is rejected as unreadable before it matters.
+    A file that cannot be read gets a camera of any size; the image is rejected as unreadable before it matters.
     """
     try:
         size, focal = size_and_focal(path)
     except (OSError, SyntaxError, ValueError):
-        size, focal = (1, 1), None
+        size, focal = _UNREADABLE, None
     start = DEFAULT_FOCAL * max(size) if focal is None else focal
     camera_id = f"unknown {size[0]}x{size[1]} {start:.0f} px"
     return Camera(camera_id, *size, start, start, size[0] / 2.0, size[1] / 2.0, estimate=unknown)
@@ -121,10 +123,10 @@ def with_unknown(camera: Camera, unknown: tuple[str, ...], path: Path) -> Camera
 
 
 def pinhole_of_row(image_id: str, intrinsics: Sequence[float], path: Path) -> Camera:
-    """The camera whose fx, fy, cx, cy stand beside an image's orientation; of one pixel where the file is no image."""
+    """The camera whose fx, fy, cx, cy stand beside an image's orientation; of any size where the file is no image."""
     try:
         width, height = image_size(path)
     except (OSError, SyntaxError, ValueError):  # it is rejected as unreadable before the size matters
-        width, height = 1, 1
+        width, height = _UNREADABLE
     fx, fy, cx, cy = (float(v) for v in intrinsics)
     return Camera(image_id, width, height, fx, fy, cx, cy)
