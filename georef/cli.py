@@ -116,6 +116,9 @@ def demo(
     *,
     output: Annotated[Path, Parameter(name=["--output", "-o"], help="Where all results go.")] = Path("georef-demo"),
     large: Annotated[bool, Parameter(help="All cameras of both vehicles, and pedestrians.", negative="")] = False,
+    evaluation: Annotated[
+        bool, Parameter(help="Two reference epochs, and new images of many kinds of cameras.", negative="")
+    ] = False,
     seed: Annotated[int, Parameter(help="Of the street and all its errors.")] = 0,
     change: Annotated[float, Parameter(help="0 to 1: how much changes between the epochs.")] = 1.0,
     preset: Preset = None,
@@ -125,7 +128,7 @@ def demo(
     from georef.project import open_project
     from georef.stages.demo import against_truth, demo_options, render_missing, survey_files
 
-    options = demo_options(seed, change, large=large)
+    options = demo_options(seed, change, large=large, evaluation=evaluation)
     folder = survey_files(options)
     project = open_project(folder, data=folder, output=output, preset=preset, settings=set_)
     start = time.process_time()

@@ -43,7 +43,7 @@ class Stage:
 def _reference_files(project: Project, survey: Survey) -> dict[str, Any]:
     return {
         "crs": project.file.crs.model_dump(),
-        "reference": project.file.reference.model_dump(),
+        "reference": {name: section.model_dump() for name, section in project.file.reference_epochs.items()},
         "reference tables": _digest(survey.reference),
     }
 
@@ -53,12 +53,12 @@ def _epoch_files(project: Project, survey: Survey) -> dict[str, Any]:
 
 
 def _all_images(project: Project, survey: Survey) -> dict[str, Any]:
-    return {"images": _states_of(survey.reference, survey.epoch)}
+    return {"images": _states_of(survey, survey.reference, survey.epoch)}
 
 
 def _reference_with_images(project: Project, survey: Survey) -> dict[str, Any]:
     features_version = features.extractor_version(project.config.features)
-    reference = {"features": features_version, "images": _states_of(survey.reference)}
+    reference = {"features": features_version, "images": _states_of(survey, survey.reference)}
     return {**_reference_files(project, survey), **reference}
 
 
@@ -236,8 +236,8 @@ def _plain(value: Any) -> Any:
     return value
 
 
-def _states_of(*campaigns: Campaign) -> str:
-    return _hash([_state(image.path) for campaign in campaigns for image in campaign.images])
+def _states_of(survey: Survey, *campaigns: Campaign) -> str:
+    return _hash([_state(survey.source_of(image)) for campaign in campaigns for image in campaign.images])
 
 
 def _state(path: Path) -> list[Any]:

@@ -17,6 +17,9 @@ from georef.errors import ConfigError
 PROJECT_FILE = "project.toml"
 AngleConvention = Literal["omega-phi-kappa", "yaw-pitch-roll"]
 AngleUnit = Literal["deg", "gon", "rad"]
+Unknown = Literal["focal", "k1", "k2"]
+REFERENCE = "reference"  # the name of the only reference epoch of a project
+_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]*")
 
 
 class CrsSection(Section):
@@ -46,6 +49,19 @@ class ReferenceSigma(Section):
         return value
 
 
+def _refuse_cameras_of_panoramas(cameras: str | None, panorama: PanoramaSection | None) -> None:
+    if cameras is not None and panorama is not None:
+        raise ValueError("panoramas have no camera table: name their heads with panorama.heads, and leave out cameras")
+
+
+class PanoramaSection(Section):
+    """The images are panoramas; pinhole heads are cut from them, five standard ones without a table of heads."""
+
+    projection: Literal["equirectangular", "cube-map"]
+    heads: str | None = None
+    stitching_radius_m: float | None = Field(default=None, gt=0)
+
+
 class ReferenceSection(Section):
     images: str
     cameras: str | None = None
@@ -54,14 +70,47 @@ class ReferenceSection(Section):
     angle_unit: AngleUnit
     sigma: Literal["estimate"] | ReferenceSigma = "estimate"
     unmatched: Literal["refuse", "skip"] = "refuse"
+    panorama: PanoramaSection | None = None
     table: TableSection = TableSection()
+
+    @model_validator(mode="after")
+    def _one_source_of_cameras(self) -> ReferenceSection:
+        _refuse_cameras_of_panoramas(self.cameras, self.panorama)
+        return self
 
 
 class EpochSection(Section):
+    """intrinsics: what is not known of the cameras; "estimate" is the focal length and k1."""
+
     images: str
-    cameras: str
+    cameras: str | None = None
     gnss: str | None = None
+    intrinsics: Literal["estimate"] | tuple[Unknown, ...] | None = None
+    panorama: PanoramaSection | None = None
     table: TableSection = TableSection()
+
+    @model_validator(mode="after")
+    def _one_source_of_cameras(self) -> EpochSection:
+        _refuse_cameras_of_panoramas(self.cameras, self.panorama)
+        if self.panorama is not None and self.intrinsics is not None:
+            raise ValueError("the heads of a panorama are known cameras: leave out intrinsics")
+        if self.cameras is None and self.panorama is None and "focal" not in self.unknown:
+            raise ValueError(
+                'nothing says what cameras took its images: name a table with `cameras`, or set intrinsics = "estimate"'
+            )
+        return self
+
+    @field_validator("intrinsics")
+    @classmethod
+    def _possible(cls, value: Any) -> Any:
+        if isinstance(value, tuple) and (len(set(value)) < len(value) or {"k1", "k2"} & set(value) == {"k2"}):
+            raise ValueError('each of "focal", "k1", "k2" at most once, and k2 only together with k1')
+        return value
+
+    @property
+    def unknown(self) -> tuple[Unknown, ...]:
+        """Which intrinsics are to be estimated of every image of the epoch."""
+        return ("focal", "k1") if self.intrinsics == "estimate" else self.intrinsics or ()
 
 
 class PointsSection(Section):
@@ -76,19 +125,40 @@ class ProjectFile(Section):
 
     name: str = Field(min_length=1)
     crs: CrsSection
-    reference: ReferenceSection
+    reference: ReferenceSection | None = None
+    references: dict[str, ReferenceSection] = Field(default_factory=dict)
     epochs: dict[str, EpochSection] = Field(min_length=1)
     points: PointsSection | None = None
     preset: str = "default"
     config: dict[str, Any] = Field(default_factory=dict)
 
-    @field_validator("epochs")
+    @field_validator("epochs", "references")
     @classmethod
-    def _epoch_names(cls, epochs: dict[str, EpochSection]) -> dict[str, EpochSection]:
+    def _epoch_names(cls, epochs: dict[str, Any]) -> dict[str, Any]:
         for name in epochs:
-            if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_.-]*", name) or name == "reference":
+            if not _NAME.fullmatch(name) or name == REFERENCE:
                 raise ValueError(f"the epoch name '{name}' must be letters, digits, '_', '.', '-', and not 'reference'")
         return epochs
+
+    @model_validator(mode="after")
+    def _references(self) -> ProjectFile:
+        if (self.reference is None) == (not self.references):
+            raise ValueError("a project has a section [reference], or one [references.NAME] for each reference epoch")
+        both = set(self.references) & set(self.epochs)
+        if both:
+            raise ValueError(f"a reference epoch and a new epoch have the same name: {', '.join(sorted(both))}")
+        estimated = {name for name, section in self.reference_epochs.items() if section.sigma == "estimate"}
+        if 0 < len(estimated) < len(self.reference_epochs):
+            raise ValueError(
+                f"the sigma of {', '.join(sorted(estimated))} is to be estimated and that of others is given; "
+                "give all of them, or estimate all"
+            )
+        return self
+
+    @property
+    def reference_epochs(self) -> dict[str, ReferenceSection]:
+        """The reference epochs by name."""
+        return self.references if self.reference is None else {REFERENCE: self.reference}
 
     @model_validator(mode="after")
     def _marks_name_epochs(self) -> ProjectFile:
@@ -119,6 +189,11 @@ class Project:
         """Folders of all runs of a stage, oldest first."""
         parent = self.output / "work" / epoch / stage
         return sorted((p for p in parent.glob("*") if p.is_dir()), key=lambda p: p.stat().st_mtime)
+
+    @property
+    def panorama_folder(self) -> Path:
+        """Where the heads that are cut from panoramas lie."""
+        return self.output / "work" / "panoramas"
 
     @property
     def feature_folder(self) -> Path:
@@ -182,11 +257,12 @@ def _data_root(file: ProjectFile, folder: Path, data: Path | None) -> Path:
     else:
         named = Path(environment) if environment else None
         tried = [*([named, named / folder.name] if named else []), folder]
+    wanted = next(iter(file.reference_epochs.values())).exterior_orientation
     for root in tried:
-        if (root / file.reference.exterior_orientation).is_file():
+        if (root / wanted).is_file():
             return root.resolve()
     raise ConfigError(
         f"The data of project '{file.name}' were not found.\n"
-        f"Expected {file.reference.exterior_orientation} in {' or '.join(str(root) for root in tried)}.\n"
+        f"Expected {wanted} in {' or '.join(str(root) for root in tried)}.\n"
         "Name the folder with --data DIR or in the environment variable GEOREF_DATA."
     )

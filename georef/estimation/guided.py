@@ -1,33 +1,68 @@
-"""Matching of two images whose poses are known: mutual nearest descriptors within the epipolar band."""
+"""Matching of two images whose poses are known: mutual nearest descriptors within the epipolar band.
+
+Epipolar geometry holds for rays, of any camera: two rays and the base lie in one plane. How far they are from it is
+told in pixels of each image.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from georef.features.nearest import similarity
-from georef.geometry.camera import Camera, ideal_from_observed
+from georef.geometry.camera import Camera, ray_derivatives, rays_from_pixels
 from georef.geometry.rigid import Array, Rigid3, skew
 from georef.types.features import Features, Matches
+
+_ROUNDING = 1.001  # of single precision
+
+
+@dataclass(frozen=True, eq=False)
+class Bearings:
+    """Where the keypoints of an image look, in its camera frame; NaN for a keypoint outside of what the lens shows."""
+
+    rays: Array  # (N, 3), of z = 1 or of unit length
+    by_pixel: Array  # (N, 3, 2) derivatives of the rays
+
+    @staticmethod
+    def of(camera: Camera, pixels: Array) -> Bearings:
+        rays = rays_from_pixels(camera, pixels)
+        return Bearings(rays, ray_derivatives(camera, rays))
+
+    def take(self, indices: NDArray[np.integer] | slice) -> Bearings:
+        return Bearings(self.rays[indices], self.by_pixel[indices])
 
 
 @dataclass(frozen=True, eq=False)
 class PosedFeatures:
-    """The features of an image with its pose and ideal (distortion-free) keypoints."""
+    """The features of an image with its camera, its pose and the viewing directions of its keypoints."""
 
     features: Features
     camera: Camera
     world_from_cam: Rigid3
-    ideal_px: Array  # (N, 2)
+    bearings: Bearings
 
     @staticmethod
     def of(features: Features, camera: Camera, world_from_cam: Rigid3) -> PosedFeatures:
-        return PosedFeatures(features, camera, world_from_cam, ideal_from_observed(camera, features.keypoints_px))
+        pixels = features.keypoints_px.astype(np.float64)
+        return PosedFeatures(features, camera, world_from_cam, Bearings.of(camera, pixels))
+
+    @cached_property
+    def pixels(self) -> Array:
+        """The observed keypoints (N, 2), float64."""
+        return self.features.keypoints_px.astype(np.float64)
 
     def posed(self, world_from_cam: Rigid3) -> PosedFeatures:
-        return PosedFeatures(self.features, self.camera, world_from_cam, self.ideal_px)
+        return PosedFeatures(self.features, self.camera, world_from_cam, self.bearings)
+
+    def head(self, count: int) -> PosedFeatures:
+        """The same image with its `count` best features."""
+        return PosedFeatures(
+            self.features.head(count), self.camera, self.world_from_cam, self.bearings.take(slice(count))
+        )
 
 
 @dataclass(frozen=True)
@@ -37,11 +72,10 @@ class GuidedOptions:
     ratio: float  # best descriptor distance over the second best in the band
 
 
-def fundamental_matrix(a: PosedFeatures, b: PosedFeatures) -> Array:
-    """F (3, 3) with x_b^T F x_a = 0 for ideal pixels. Hartley and Zisserman (2004), eq. 9.2."""
+def essential_matrix(a: PosedFeatures, b: PosedFeatures) -> Array:
+    """E (3, 3) with d_b^T E d_a = 0 for rays d of one point. Hartley and Zisserman (2004), section 9.6."""
     b_from_a = b.world_from_cam.inverse() @ a.world_from_cam
-    essential = skew(b_from_a.translation) @ b_from_a.rotation
-    return np.linalg.inv(b.camera.matrix).T @ essential @ np.linalg.inv(a.camera.matrix)
+    return skew(b_from_a.translation) @ b_from_a.rotation
 
 
 def guided_matches(a: PosedFeatures, b: PosedFeatures, options: GuidedOptions, known: Matches | None = None) -> Matches:
@@ -69,29 +103,55 @@ def guided_matches(a: PosedFeatures, b: PosedFeatures, options: GuidedOptions, k
 
 
 def epipolar_distances(a: PosedFeatures, b: PosedFeatures, indices: NDArray[np.integer]) -> Array:
-    """Distances (M, 2) in pixels of matched keypoints (M, 2) from each other's epipolar lines, in a and in b."""
-    f = fundamental_matrix(a, b)
-    in_a = np.column_stack([a.ideal_px[indices[:, 0]], np.ones(len(indices))])
-    in_b = np.column_stack([b.ideal_px[indices[:, 1]], np.ones(len(indices))])
-    line_in_a, line_in_b = in_b @ f, in_a @ f.T
-    off = np.abs(np.einsum("ni,ni->n", in_b, line_in_b))
-    return np.column_stack([off / np.linalg.norm(line[:, :2], axis=1) for line in (line_in_a, line_in_b)])
+    """Distances (M, 2) in pixels of matched keypoints (M, 2) from each other's epipolar curves, in a and in b.
+
+    The misclosure d_b^T E d_a over its derivative by the pixel: exact in a pinhole image, of first order in others.
+    """
+    essential = essential_matrix(a, b)
+    in_a, in_b = a.bearings.take(indices[:, 0]), b.bearings.take(indices[:, 1])
+    normal_in_a, normal_in_b = in_b.rays @ essential, in_a.rays @ essential.T
+    off = np.abs(np.einsum("ni,ni->n", in_b.rays, normal_in_b))
+    rates = [
+        np.linalg.norm(np.einsum("ni,nik->nk", normal, bearings.by_pixel), axis=1)
+        for normal, bearings in ((normal_in_a, in_a), (normal_in_b, in_b))
+    ]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return off[:, None] / np.column_stack(rates)
 
 
 def epipolar_band(a: PosedFeatures, b: PosedFeatures, gate: float) -> NDArray[np.bool_]:
-    """(N, M) pairs whose distance from each other's epipolar line is at most `gate` keypoint scales in both images.
+    """(N, M) pairs whose distance from each other's epipolar curve is at most `gate` keypoint scales in both images.
 
-    Images from one place have no epipolar lines: no pair.
+    Images from one place have no epipolar planes: no pair.
     """
-    f = fundamental_matrix(a, b).astype(np.float32)
-    in_a, in_b = _homogeneous(a.ideal_px), _homogeneous(b.ideal_px)
-    lines_in_b, lines_in_a = in_a @ f.T, in_b @ f
+    near = _nearly_in_band(a, b, gate)
+    pairs = np.argwhere(near)
+    limits = gate * np.column_stack([a.features.scales_px[pairs[:, 0]], b.features.scales_px[pairs[:, 1]]])
+    inside = (epipolar_distances(a, b, pairs) <= limits).all(axis=1)
+    near[pairs[~inside, 0], pairs[~inside, 1]] = False
+    return near
+
+
+def _nearly_in_band(a: PosedFeatures, b: PosedFeatures, gate: float) -> NDArray[np.bool_]:
+    """The band, and pairs a little beyond it: with the largest rate of the misclosure that a keypoint can have."""
+    essential = essential_matrix(a, b).astype(np.float32)
+    in_a, in_b = a.bearings.rays.astype(np.float32), b.bearings.rays.astype(np.float32)
+    reach_a, reach_b = (gate * _ROUNDING * i.features.scales_px * _largest_rate(i.bearings) for i in (a, b))
+    normals_in_b, normals_in_a = in_a @ essential.T, in_b @ essential
     with np.errstate(divide="ignore", invalid="ignore"):
-        lines_in_b /= np.linalg.norm(lines_in_b[:, :2], axis=1, keepdims=True) * gate
-        lines_in_a /= np.linalg.norm(lines_in_a[:, :2], axis=1, keepdims=True) * gate
-        near_in_b = np.abs(lines_in_b @ in_b.T) <= b.features.scales_px[None, :]
-        near_in_a = np.abs(in_a @ lines_in_a.T) <= a.features.scales_px[:, None]
+        normals_in_b /= np.linalg.norm(normals_in_b, axis=1, keepdims=True)
+        normals_in_a /= np.linalg.norm(normals_in_a, axis=1, keepdims=True)
+        near_in_b = np.abs(normals_in_b @ in_b.T) <= reach_b[None, :]
+        near_in_a = np.abs(in_a @ normals_in_a.T) <= reach_a[:, None]
     return near_in_b & near_in_a
+
+
+def _largest_rate(bearings: Bearings) -> NDArray[np.float32]:
+    """By how much a pixel moves a ray at most: the largest singular values (N,) of the derivatives."""
+    square = np.swapaxes(bearings.by_pixel, 1, 2) @ bearings.by_pixel
+    half_trace = 0.5 * (square[:, 0, 0] + square[:, 1, 1])
+    spread = np.hypot(0.5 * (square[:, 0, 0] - square[:, 1, 1]), square[:, 0, 1])
+    return np.sqrt(half_trace + spread).astype(np.float32)
 
 
 def _distinct(cosine: Array, rows: NDArray[np.integer], best: NDArray[np.integer], score: Array, ratio: float) -> Array:
@@ -100,7 +160,3 @@ def _distinct(cosine: Array, rows: NDArray[np.integer], best: NDArray[np.integer
     second[rows, best] = -1.0
     runner_up = second.max(axis=1)
     return np.maximum(1.0 - score, 0.0) <= ratio * ratio * np.maximum(1.0 - runner_up, 1e-9)
-
-
-def _homogeneous(pixels: Array) -> NDArray[np.float32]:
-    return np.column_stack([pixels, np.ones(len(pixels))]).astype(np.float32)

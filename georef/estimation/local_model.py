@@ -90,7 +90,7 @@ def _gather(
     pairs = np.concatenate([m.indices for m in matches] or [nothing]).astype(np.int64)
     view = np.repeat(np.arange(len(matches)), [len(m) for m in matches])
     both = list(zip(references, (m.indices[:, 1] for m in matches), strict=True))
-    pixel = np.concatenate([r.ideal_px[k] for r, k in both] or [nothing.astype(float)])
+    pixel = np.concatenate([r.pixels[k] for r, k in both] or [nothing.astype(float)])
     scale = np.concatenate([r.features.scales_px[k] for r, k in both] or [np.zeros(0)]).astype(np.float64)
     keypoint, point = np.unique(pairs[:, 0], return_inverse=True)
     return keypoint, Observations(point, view, pixel, keypoint_sigma * scale, pairs[:, 1])

@@ -9,25 +9,23 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import pycolmap
 from numpy.typing import NDArray
-from scipy.stats import chi2
 
 from georef.config import CandidatesConfig, LocalizeConfig
 from georef.estimation.candidates import Box, overlap, search_box
+from georef.estimation.first_pose import FirstPose, QueryImage, ransac_pose
 from georef.estimation.guided import GuidedOptions, PosedFeatures, guided_matches
 from georef.estimation.local_model import LocalModel, query_centred_model
-from georef.estimation.pnp import EstimatedPose, QueryImage, ransac_pose, refine_pose, refit_pose, with_covariance
+from georef.estimation.pnp import EstimatedPose, refine_pose, refit_pose, with_covariance
+from georef.estimation.prior_check import against_prior
 from georef.estimation.published import VerifyPair, published_model, verify_pair
 from georef.estimation.reference_map import ReferenceMap
 from georef.estimation.search import FindSimilar, Search
 from georef.features.base import Matcher
-from georef.geometry.covariance import position_cov_in_world
+from georef.geometry.camera import Camera
 from georef.geometry.rigid import Rigid3
 from georef.types.campaign import Image
 from georef.types.features import Features, Matches
 from georef.types.results import Localized, Outcome, ReferenceMatches, Rejected, RejectReason
-
-_PRIOR_PROBABILITY = 0.9999
-_STRONG_EVIDENCE = 3  # times min_inliers: then the images overrule a position prior
 
 
 @dataclass
@@ -48,9 +46,13 @@ class _Work:
     pairs: dict[int, Matches] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        self.posed = PosedFeatures.of(self.features, self.image.camera, Rigid3.identity())
+        self.use(self.image.camera)
+
+    def use(self, camera: Camera) -> None:
+        """Go on with another camera of the query image: one that was estimated."""
+        self.posed = PosedFeatures.of(self.features, camera, Rigid3.identity())
         sigma = self.reference.noise.keypoint_sigma * self.features.scales_px.astype(np.float64)
-        self.query = QueryImage(self.image.camera, self.posed.ideal_px, sigma)
+        self.query = QueryImage(camera, self.posed.pixels, sigma)
 
     def timed(self, step: str) -> _Timer:
         return _Timer(self.cpu_s, step)
@@ -82,7 +84,7 @@ def localize_image(
             f"inside the search box: {outcome.reason.value} ({outcome.detail}); tried the whole reference"
         )
         outcome = _localize_in(work, search_box(search.positions, None, candidates))
-    return replace(_against_prior(outcome, image, config), notes=tuple(work.notes))
+    return replace(against_prior(outcome, image, config), notes=tuple(work.notes))
 
 
 def _localize_in(work: _Work, box: Box) -> Outcome:
@@ -109,13 +111,20 @@ def _query_centred(work: _Work, ranked: NDArray[np.int64]) -> Outcome:
         return first or Rejected(work.image.image_id, RejectReason.NO_CANDIDATES, "no reference image")
     pose, model = first
     chosen = _that_see(work, ranked, pose, model)
+    estimate, model = _guided_pose(work, pose, chosen)
+    if work.image.camera.estimate and estimate is not None:  # its lines were those of a camera from few matches
+        work.use(estimate.camera)
+        estimate, model = _guided_pose(work, estimate.world_from_cam, chosen)
+    return _outcome(work, estimate, model, chosen)
+
+
+def _guided_pose(work: _Work, pose: Rigid3, chosen: Sequence[int]) -> tuple[EstimatedPose | None, LocalModel]:
     with work.timed("guided matching"):
         matches = [_guided(work, pose, index) for index in chosen]
     with work.timed("pose"):
         references = [work.reference.posed(i) for i in chosen]
         model = query_centred_model(references, matches, work.reference.noise.keypoint_sigma)
-        estimate = refine_pose(pose, work.query, model, lambda v: work.reference.pose_cov(chosen[v]))
-    return _outcome(work, estimate, model, chosen)
+        return refine_pose(pose, work.query, model, lambda v: work.reference.pose_cov(chosen[v])), model
 
 
 def _first_pose(work: _Work, indices: list[int]) -> tuple[Rigid3, LocalModel] | Rejected:
@@ -127,12 +136,30 @@ def _first_pose(work: _Work, indices: list[int]) -> tuple[Rigid3, LocalModel] | 
             total = sum(len(m) for m in matches)
             detail = f"{len(model)} points that two references agree on, of {total} matches in {len(indices)} images"
             return Rejected(work.image.image_id, RejectReason.FEW_MATCHES, detail)
-        found = ransac_pose(work.query, model, work.config.ransac_gate_px, work.config.seed)
-        inliers = 0 if found is None else int(found[1].sum())
-        if found is None or not _enough(inliers, len(model), work.config):
-            detail = f"{inliers} of {len(model)} points agree with one pose"
-            return Rejected(work.image.image_id, RejectReason.FEW_INLIERS, detail)
-        return found[0], model.take(found[1])
+        found = _consensus(work, model)
+        if isinstance(found, Rejected):
+            return found
+        model = model.take(found.inliers)
+        if not work.image.camera.estimate:
+            return found.world_from_cam, model
+        refined = refine_pose(found.world_from_cam, work.query, model, lambda v: work.reference.pose_cov(indices[v]))
+        if refined is None:
+            detail = f"{len(model)} points do not fix the pose and the camera"
+            return Rejected(work.image.image_id, RejectReason.DEGENERATE, detail)
+        work.use(refined.camera)
+        return refined.world_from_cam, model
+
+
+def _consensus(work: _Work, model: LocalModel) -> FirstPose | Rejected:
+    """The pose that enough points agree with; from here on `work` has the camera that it was found with."""
+    work.use(work.image.camera)
+    found = ransac_pose(work.query, model, work.config.ransac_gate_px, work.config.seed)
+    inliers = 0 if found is None else int(found.inliers.sum())
+    if found is None or not _enough(inliers, len(model), work.config):
+        detail = f"{inliers} of {len(model)} points agree with one pose"
+        return Rejected(work.image.image_id, RejectReason.FEW_INLIERS, detail)
+    work.use(found.camera)
+    return found
 
 
 def _matched(work: _Work, index: int) -> Matches:
@@ -173,12 +200,15 @@ def _published(work: _Work, ranked: NDArray[np.int64]) -> Outcome:
     with work.timed("pose"):
         if len(model) < work.config.min_inliers:
             return Rejected(work.image.image_id, RejectReason.FEW_MATCHES, f"{len(model)} triangulated points")
-        found = ransac_pose(work.query, model, work.config.ransac_gate_px, work.config.seed)
-        inliers = 0 if found is None else int(found[1].sum())
-        if found is None or not _enough(inliers, len(model), work.config):
-            detail = f"{inliers} of {len(model)} points agree with one pose"
-            return Rejected(work.image.image_id, RejectReason.FEW_INLIERS, detail)
-        estimate = with_covariance(found[0], work.query, model, found[1], lambda v: work.reference.pose_cov(chosen[v]))
+        found = _consensus(work, model)
+        if isinstance(found, Rejected):
+            return found
+        pose, covs = found.world_from_cam, lambda v: work.reference.pose_cov(chosen[v])
+        if work.image.camera.estimate:  # COLMAP has estimated no covariance, and no distortion
+            model = model.take(found.inliers)
+            estimate = refine_pose(pose, work.query, model, covs)
+        else:
+            estimate = with_covariance(pose, work.query, model, found.inliers, covs)
     return _outcome(work, estimate, model, chosen)
 
 
@@ -207,7 +237,8 @@ def _thinned(
     """The pose from a random choice of the verified points, where the configuration limits their number."""
     order = np.random.default_rng(work.config.seed).permutation(len(model))
     model = model.take(np.isin(np.arange(len(model)), order[: work.config.max_correspondences]))
-    refined = refit_pose(estimate.world_from_cam, work.query, model, lambda v: work.reference.pose_cov(chosen[v]))
+    query = work.query.with_camera(estimate.camera)
+    refined = refit_pose(estimate.world_from_cam, query, model, lambda v: work.reference.pose_cov(chosen[v]))
     return model, refined or estimate
 
 
@@ -236,6 +267,8 @@ def _outcome(work: _Work, estimate: EstimatedPose | None, model: LocalModel, cho
         points_in_world=used.points,
         keypoints=used.keypoint,
         cpu_s=dict(work.cpu_s),
+        camera=estimate.camera if work.image.camera.estimate else None,
+        intrinsics_cov=estimate.intrinsics_cov if work.image.camera.estimate else None,
     )
 
 
@@ -243,21 +276,6 @@ def _reference_matches(model: LocalModel, ids: Sequence[str]) -> tuple[Reference
     obs = model.observations
     pairs = np.column_stack([model.keypoint[obs.point], obs.keypoint]).astype(np.int32)
     return tuple(ReferenceMatches(name, pairs[obs.view == i]) for i, name in enumerate(ids) if (obs.view == i).any())
-
-
-def _against_prior(outcome: Outcome, image: Image, config: LocalizeConfig) -> Outcome:
-    """Compares a pose with the position prior: strong evidence overrules the prior, weak evidence does not."""
-    if isinstance(outcome, Rejected) or image.gnss is None:
-        return outcome
-    off = outcome.world_from_cam.translation - image.gnss.position_in_world
-    cov = image.gnss.cov + position_cov_in_world(outcome.world_from_cam, outcome.world_from_cam_cov)
-    if off @ np.linalg.solve(cov, off) <= chi2.ppf(_PRIOR_PROBABILITY, 3):
-        return outcome
-    distance = float(np.linalg.norm(off))
-    if outcome.correspondence_count < _STRONG_EVIDENCE * config.min_inliers:
-        detail = f"{outcome.correspondence_count} points put it {distance:.1f} m from its position prior"
-        return Rejected(image.image_id, RejectReason.PRIOR_CONTRADICTS, detail)
-    return replace(outcome, gnss_rejected=True, gnss_offset_m=distance)
 
 
 class _Timer:

@@ -1,7 +1,8 @@
-"""Exterior orientation of one image from 2D-3D correspondences: LO-RANSAC, refinement, and a full covariance.
+"""Exterior orientation of one image from 2D-3D correspondences: refinement, and a full covariance.
 
 The refinement weights every correspondence with the noise of its keypoint and the covariance of its map point. The
 covariance adds what correspondences share: the errors of the reference poses that their points were triangulated from.
+What is not known of the camera is estimated with the pose, whose covariance is then the marginal one.
 """
 
 from __future__ import annotations
@@ -11,12 +12,12 @@ from dataclasses import dataclass
 from typing import cast
 
 import numpy as np
-import pycolmap
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
+from georef.estimation.first_pose import QueryImage
 from georef.estimation.local_model import LocalModel
-from georef.geometry.camera import Camera
+from georef.geometry.camera import Camera, intrinsic_derivatives
 from georef.geometry.covariance import symmetric
 from georef.geometry.projection import Views, linearize
 from georef.geometry.rigid import Array, Rigid3
@@ -25,15 +26,8 @@ from georef.geometry.triangulation import segment_sum
 _ITERATIONS = 20
 _CONVERGED = 1e-9
 _CAUCHY_SCALE = 2.0
-
-
-@dataclass(frozen=True, eq=False)
-class QueryImage:
-    """What of the query image enters the pose: its camera and ideal keypoints with their noise."""
-
-    camera: Camera
-    ideal_px: Array  # (N, 2)
-    sigma_px: Array  # (N,)
+_LARGEST_STEP = 0.2  # of the logarithm of the focal length, and of distortion coefficients
+_UNIT = 1e-12  # least eigenvalue of the normal matrix with unit diagonal
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,32 +37,8 @@ class EstimatedPose:
     relative_cov: Array  # (6, 6) the same without the errors of the reference poses
     inliers: NDArray[np.bool_]  # (P,) of the local model's points
     sigma0: float  # a-posteriori over a-priori standard deviation of an observation
-
-
-def ransac_pose(
-    query: QueryImage, model: LocalModel, gate_px: float, seed: int
-) -> tuple[Rigid3, NDArray[np.bool_]] | None:
-    """Pose by COLMAP's LO-RANSAC (P3P, EPnP) and its refinement, with the inliers (P,); None without consensus."""
-    camera = pycolmap.Camera(
-        model="PINHOLE",
-        width=query.camera.width,
-        height=query.camera.height,
-        params=[query.camera.fx, query.camera.fy, query.camera.cx, query.camera.cy],
-    )
-    options = pycolmap.AbsolutePoseEstimationOptions()
-    options.ransac.max_error = gate_px
-    options.ransac.random_seed = seed
-    pixels = query.ideal_px[model.keypoint]
-    # A local origin keeps COLMAP's arithmetic well conditioned far from the world's origin.
-    origin = model.points.mean(axis=0) if len(model) else np.zeros(3)
-    found = None
-    if len(model) >= 4:
-        found = pycolmap.estimate_and_refine_absolute_pose(pixels, model.points - origin, camera, options)
-    if found is None:
-        return None
-    cam_from_local = Rigid3.from_matrix(found["cam_from_world"].matrix())
-    local_from_cam = cam_from_local.inverse()
-    return Rigid3(local_from_cam.rotation, local_from_cam.translation + origin), np.asarray(found["inlier_mask"], bool)
+    camera: Camera  # as estimated; the given one where it is known
+    intrinsics_cov: Array  # (q, q) of camera.estimate, focal as its logarithm; (0, 0) where the camera is known
 
 
 def refine_pose(
@@ -80,24 +50,25 @@ def refine_pose(
 ) -> EstimatedPose | None:
     """Refines a pose on all points of a local model: Cauchy, chi-square gate, then least squares on what passed.
 
+    What query.camera does not know is refined with it, from its values.
     reference_pose_cov(i) is the covariance (6, 6) of the model's i-th reference view. None where geometry fails.
     """
-    pose = _iterate(start, query, model, np.ones(len(model), bool), robust=True)
-    if pose is None:
+    found = _iterate(start, query, model, np.ones(len(model), bool), robust=True)
+    if found is None:
         return None
     inliers = np.ones(len(model), bool)
     for _ in range(3):
-        gated = _gate(pose, query, model, inliers, gate_probability)
-        if gated is None or gated.sum() < 6:
+        gated = _gate(*found, model, inliers, gate_probability)
+        if gated is None or gated.sum() < 6 + len(query.camera.estimate):
             return None
-        refitted = _iterate(pose, query, model, gated, robust=False)
+        refitted = _iterate(*found, model, gated, robust=False)
         if refitted is None:
             return None
         settled = np.array_equal(gated, inliers)
-        pose, inliers = refitted, gated
+        found, inliers = refitted, gated
         if settled:
             break
-    return with_covariance(pose, query, model, inliers, reference_pose_cov)
+    return with_covariance(*found, model, inliers, reference_pose_cov)
 
 
 def refit_pose(
@@ -105,8 +76,8 @@ def refit_pose(
 ) -> EstimatedPose | None:
     """Least squares on all points of a local model, which are known to be good. None where geometry fails."""
     everything = np.ones(len(model), bool)
-    pose = _iterate(start, query, model, everything, robust=False)
-    return None if pose is None else with_covariance(pose, query, model, everything, reference_pose_cov)
+    found = _iterate(start, query, model, everything, robust=False)
+    return None if found is None else with_covariance(*found, model, everything, reference_pose_cov)
 
 
 def with_covariance(
@@ -116,18 +87,29 @@ def with_covariance(
     inliers: NDArray[np.bool_],
     reference_pose_cov: Callable[[int], Array],
 ) -> EstimatedPose | None:
-    """The covariance of a pose estimated from the inliers: image noise, map points, and reference poses."""
+    """The covariance of a pose estimated from the inliers: image noise, map points, and reference poses.
+
+    None where the points do not fix the pose and what is unknown of the camera.
+    """
     used = model.take(inliers)
     system = _Weighted.at(pose, query, used)
     normal = system.normal()
-    if np.linalg.eigvalsh(normal)[0] <= 0:
+    cov_unit = _inverse(normal)
+    if cov_unit is None:
         return None
-    cov_unit = cast(Array, np.linalg.inv(normal))
     squares = float(np.einsum("ni,nij,nj->", system.residual, system.weight, system.residual))
-    variance_factor = squares / max(2 * len(used) - 6, 1)
+    variance_factor = squares / max(2 * len(used) - len(normal), 1)
     relative = symmetric(variance_factor * cov_unit)
     cov = symmetric(relative + _shared_reference_part(system, cov_unit, used, reference_pose_cov))
-    return EstimatedPose(pose, cov, relative, inliers, float(np.sqrt(variance_factor)))
+    return EstimatedPose(
+        pose,
+        cov[:6, :6],
+        relative[:6, :6],
+        inliers,
+        float(np.sqrt(variance_factor)),
+        query.camera,
+        cov[6:, 6:],
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,30 +117,33 @@ class _Weighted:
     """Reprojection of a model's points into the query, linearised and weighted."""
 
     residual: Array  # (P, 2) projected minus observed
-    by_pose: Array  # (P, 2, 6)
+    by_unknown: Array  # (P, 2, 6 + q): pose, then the unknowns of the camera
     by_point: Array  # (P, 2, 3)
     cov: Array  # (P, 2, 2) of an observation, map point included
     weight: Array  # (P, 2, 2)
 
     @staticmethod
     def at(pose: Rigid3, query: QueryImage, model: LocalModel) -> _Weighted:
-        views = Views.of([pose], [query.camera])
-        lin = linearize(views, np.zeros(len(model), np.int64), model.points)
+        views, first = Views.of([pose], [query.camera]), np.zeros(len(model), np.int64)
+        lin = linearize(views, first, model.points)
+        unknown = query.camera.estimate
+        by_camera = intrinsic_derivatives(query.camera, views.to_cam(first, model.points), unknown)
+        by_unknown = np.concatenate([lin.by_pose, by_camera], axis=2)
         noise = np.square(query.sigma_px[model.keypoint])[:, None, None] * np.eye(2)
         cov = noise + lin.by_point @ model.cov @ np.swapaxes(lin.by_point, 1, 2)
         in_front = np.asarray(np.isfinite(lin.pixel).all(axis=1))
         cov[~in_front] = np.eye(2)
         weight = cast(Array, np.linalg.inv(cov) * in_front[:, None, None])
-        residual = np.nan_to_num(lin.pixel - query.ideal_px[model.keypoint], nan=1e6)
-        return _Weighted(residual, np.nan_to_num(lin.by_pose), np.nan_to_num(lin.by_point), cov, weight)
+        residual = np.nan_to_num(lin.pixel - query.pixels[model.keypoint], nan=1e6)
+        return _Weighted(residual, np.nan_to_num(by_unknown), np.nan_to_num(lin.by_point), cov, weight)
 
     def normal(self, robust_weight: Array | None = None) -> Array:
         weight = self.weight if robust_weight is None else self.weight * robust_weight[:, None, None]
-        return np.einsum("nki,nkl,nlj->ij", self.by_pose, weight, self.by_pose)
+        return np.einsum("nki,nkl,nlj->ij", self.by_unknown, weight, self.by_unknown)
 
     def gradient(self, robust_weight: Array | None = None) -> Array:
         weight = self.weight if robust_weight is None else self.weight * robust_weight[:, None, None]
-        return np.einsum("nki,nkl,nl->i", self.by_pose, weight, self.residual)
+        return np.einsum("nki,nkl,nl->i", self.by_unknown, weight, self.residual)
 
     def distance(self) -> Array:
         """Mahalanobis distances (P,)."""
@@ -167,8 +152,11 @@ class _Weighted:
 
 def _iterate(
     pose: Rigid3, query: QueryImage, model: LocalModel, selected: NDArray[np.bool_], *, robust: bool
-) -> Rigid3 | None:
-    """Gauss-Newton on the selected points; with Cauchy weights at the scale that the residuals themselves show."""
+) -> tuple[Rigid3, QueryImage] | None:
+    """Gauss-Newton on the selected points; with Cauchy weights at the scale that the residuals themselves show.
+
+    The camera of the query that is returned is the estimated one.
+    """
     used = model.take(selected)
     for _ in range(_ITERATIONS):
         system = _Weighted.at(pose, query, used)
@@ -181,10 +169,13 @@ def _iterate(
             step = -np.linalg.solve(system.normal(weight), system.gradient(weight))
         except np.linalg.LinAlgError:
             return None
-        pose = pose.retract(step)
+        if query.camera.estimate:
+            step = step * min(1.0, _LARGEST_STEP / max(float(np.abs(step[6:]).max()), 1e-12))
+            query = query.with_camera(query.camera.changed(query.camera.estimate, step[6:]))
+        pose = pose.retract(step[:6])
         if float(np.abs(step).max()) < _CONVERGED:
             break
-    return pose
+    return pose, query
 
 
 def _gate(
@@ -193,9 +184,10 @@ def _gate(
     """Points whose residual r passes r' Qvv^-1 r / s0^2 <= chi2_2, where Qvv = S - A Qxx A' inside the fit."""
     system = _Weighted.at(pose, query, model)
     normal = system.normal(inliers.astype(float))
-    if np.linalg.eigvalsh(normal)[0] <= 0:
+    inverse = _inverse(normal)
+    if inverse is None:
         return None
-    fitted = system.by_pose @ np.linalg.inv(normal) @ np.swapaxes(system.by_pose, 1, 2)
+    fitted = system.by_unknown @ inverse @ np.swapaxes(system.by_unknown, 1, 2)
     cofactor = system.cov + np.where(inliers[:, None, None], -fitted, fitted)
     statistic = np.einsum("ni,nij,nj->n", system.residual, np.linalg.pinv(cofactor, hermitian=True), system.residual)
     scale2 = float(np.median(statistic[inliers])) / chi2.ppf(0.5, 2)
@@ -205,18 +197,30 @@ def _gate(
 def _shared_reference_part(
     system: _Weighted, cov_unit: Array, model: LocalModel, reference_pose_cov: Callable[[int], Array]
 ) -> Array:
-    """Covariance (6, 6) that the errors of the reference poses bring, points that share a reference moving together.
+    """Covariance (6 + q, 6 + q) that the errors of the reference poses bring.
 
-    A reference pose error e moves a point by -N^-1 sum(A' W B) e, with A and B the derivatives of its observations by
-    point and pose; the query pose follows by its own normal equations.
+    Points that share a reference move together: a reference pose error e moves a point by -N^-1 sum(A' W B) e, with A
+    and B the derivatives of its observations by point and pose; the query pose follows by its own normal equations.
     """
     obs = model.observations
     lin = linearize(model.views, obs.view, model.points[obs.point])
     pull = np.einsum("nki,nkj->nij", lin.by_point, lin.by_pose) / np.square(obs.sigma_px)[:, None, None]
     point_by_pose = model.cov[obs.point] @ pull  # (n, 3, 6)
-    gain = cov_unit @ np.swapaxes(system.by_pose, 1, 2) @ system.weight @ system.by_point  # (P, 6, 3)
+    gain = cov_unit @ np.swapaxes(system.by_unknown, 1, 2) @ system.weight @ system.by_point  # (P, 6 + q, 3)
     by_reference = segment_sum(gain[obs.point] @ point_by_pose, obs.view, len(model.views))
     return sum(
         (c @ reference_pose_cov(i) @ c.T for i, c in enumerate(by_reference)),
-        start=np.zeros((6, 6)),
+        start=np.zeros_like(cov_unit),
     )
+
+
+def _inverse(normal: Array) -> Array | None:
+    """The inverse of a normal matrix; None where it is singular to working precision."""
+    diagonal = np.diag(normal)
+    if not (diagonal > 0).all():
+        return None
+    scale = 1.0 / np.sqrt(diagonal)  # radians, metres and coefficients differ by orders of magnitude
+    scaled = normal * scale[:, None] * scale[None, :]
+    if np.linalg.eigvalsh(scaled)[0] <= _UNIT:
+        return None
+    return cast(Array, np.linalg.inv(scaled)) * scale[:, None] * scale[None, :]

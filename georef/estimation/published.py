@@ -13,6 +13,7 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
+from georef.estimation.colmap import colmap_camera
 from georef.estimation.guided import PosedFeatures
 from georef.estimation.local_model import LocalModel
 from georef.features.base import Matcher
@@ -31,9 +32,9 @@ def verify_pair(a: PosedFeatures, b: PosedFeatures, matcher: Matcher, match_keyp
     indices = matches.indices.astype(np.uint32)
     options = pycolmap.TwoViewGeometryOptions()
     options.ransac.random_seed = 0
-    return pycolmap.estimate_calibrated_two_view_geometry(
-        _colmap_camera(a, 1), a.ideal_px, _colmap_camera(b, 2), b.ideal_px, indices, options
-    )
+    known = not (a.camera.estimate or b.camera.estimate)
+    verify = pycolmap.estimate_calibrated_two_view_geometry if known else pycolmap.estimate_two_view_geometry
+    return verify(colmap_camera(a.camera, 1), a.pixels, colmap_camera(b.camera, 2), b.pixels, indices, options)
 
 
 def published_model(references: Sequence[PosedFeatures], verify: VerifyPair, noise: ReferenceNoise) -> LocalModel:
@@ -59,10 +60,10 @@ def _triangulated(references: Sequence[PosedFeatures], graph: pycolmap.Correspon
     """Points from the references at their given poses."""
     reconstruction = pycolmap.Reconstruction()
     for index, reference in enumerate(references):
-        camera = _colmap_camera(reference, index + 1)
+        camera = colmap_camera(reference.camera, index + 1)
         reconstruction.add_camera_with_trivial_rig(camera)
         image = pycolmap.Image(
-            name=str(index), keypoints=reference.ideal_px, camera_id=camera.camera_id, image_id=index + 1
+            name=str(index), keypoints=reference.pixels, camera_id=camera.camera_id, image_id=index + 1
         )
         pose = reference.world_from_cam.inverse()
         reconstruction.add_image_with_trivial_frame(image, pycolmap.Rigid3d(pose.matrix()[:3]))
@@ -99,7 +100,7 @@ def _model_of_query(
         for element in reconstruction.point3D(point).track.elements
     ]
     table = np.array(rows, dtype=np.int64).reshape(-1, 3)
-    pixel = np.array([references[v].ideal_px[k] for _, v, k in rows]).reshape(-1, 2)
+    pixel = np.array([references[v].pixels[k] for _, v, k in rows]).reshape(-1, 2)
     scale = np.array([references[v].features.scales_px[k] for _, v, k in rows], dtype=np.float64)
     observations = Observations(table[:, 0], table[:, 1], pixel, noise.keypoint_sigma * scale, table[:, 2])
     views = Views.of([r.world_from_cam for r in references], [r.camera for r in references])
@@ -107,10 +108,3 @@ def _model_of_query(
     solved = triangulate(views, table[:, 0], table[:, 1], pixel, observations.sigma_px, len(chosen))
     model = LocalModel(np.array(list(chosen), dtype=np.int64), points, solved.cov, views, observations)
     return model.take(np.asarray(np.isfinite(solved.cov).all(axis=(1, 2))))
-
-
-def _colmap_camera(image: PosedFeatures, camera_id: int) -> pycolmap.Camera:
-    c = image.camera
-    return pycolmap.Camera(
-        model="PINHOLE", width=c.width, height=c.height, params=[c.fx, c.fy, c.cx, c.cy], camera_id=camera_id
-    )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -59,7 +60,12 @@ class ReferenceMap:
         return Views.of([self.poses[i] for i in indices], [self.images[i].camera for i in indices])
 
     def pose_cov(self, index: int) -> Array:
-        return self.noise.pose_cov(self.poses[index])
+        """Covariance (6, 6) of a reference pose: as it is declared for its epoch, else as estimated for all."""
+        given = self.images[index].given_sigma
+        noise = self.noise
+        if given is not None and noise.source == "declared":
+            noise = replace(noise, position_sigma_m=given.position_m, rotation_sigma_rad=given.rotation_rad)
+        return noise.pose_cov(self.poses[index])
 
 
 def _remember(cache: OrderedDict, key: object, size: int, make: Callable):

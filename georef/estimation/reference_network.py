@@ -91,7 +91,7 @@ def match_network(
 def _pair_votes(images: Sequence[PosedFeatures], gate: float) -> NDArray[np.int64]:
     """Mutual nearest neighbours among the best features that also lie on each other's epipolar lines."""
     matcher = MutualNearest(ratio=0.95)
-    heads = [_head(image, _VOTERS) for image in images]
+    heads = [image.head(_VOTERS) for image in images]
     votes = np.zeros((len(images), len(images)), np.int64)
     for i in range(len(images)):
         for j in range(i):
@@ -99,10 +99,6 @@ def _pair_votes(images: Sequence[PosedFeatures], gate: float) -> NDArray[np.int6
             band = epipolar_band(heads[i], heads[j], gate)
             votes[i, j] = votes[j, i] = int(band[pairs[:, 0], pairs[:, 1]].sum())
     return votes
-
-
-def _head(image: PosedFeatures, count: int) -> PosedFeatures:
-    return replace(image, features=image.features.head(count), ideal_px=image.ideal_px[:count])
 
 
 def estimate_noise(

@@ -128,6 +128,6 @@ def _lookup(
     pixel, scale = np.zeros((len(view), 2)), np.zeros(len(view))
     for index, image in enumerate(images):
         here = view == index
-        pixel[here] = image.ideal_px[keypoint[here]]
+        pixel[here] = image.pixels[keypoint[here]]
         scale[here] = image.features.scales_px[keypoint[here]]
     return pixel, scale

@@ -15,17 +15,16 @@ from typing import cast
 import numpy as np
 from numpy.typing import NDArray
 
-from georef.geometry.camera import Camera, ideal_from_observed
+from georef.geometry.camera import Camera
 from georef.geometry.projection import Views, linearize
 from georef.geometry.rigid import Array, Rigid3
 from georef.geometry.triangulation import triangulate
-from georef.types.constraints import CheckPoint, Mark
+from georef.types.constraints import CheckPoint
 
 JointPoseCov = Callable[[list[int]], Array]
 """Joint covariance (6k, 6k) of the poses with k indices, in their order: (rad, m), right perturbations."""
 
 _ITERATIONS, _CONVERGED = 20, 1e-6
-_STEP_PX = 0.25  # half the base of the central difference for the undistortion: good to 1e-8
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,10 +104,10 @@ def intersect(point: CheckPoint, images: PosedImages) -> Intersection | str:
     seen_in = sorted({int(i) for i in view})
     if len(seen_in) < 2:
         return f"{len(marks)} of {len(point.marks)} marks lie in images with a pose, in {len(seen_in)} image(s)"
-    ideal, whitener = _ideal_marks(marks, [images.cameras[i] for i in view])
+    pixel = np.array([mark.pixel for mark in marks], dtype=np.float64)
     sigma_px = np.array([mark.sigma_px for mark in marks])
-    start = triangulate(images.views, np.zeros(len(marks), np.int64), view, ideal, sigma_px, 1).points[0]
-    solved = _solve(images.views, view, ideal, whitener, start) if np.isfinite(start).all() else None
+    start = triangulate(images.views, np.zeros(len(marks), np.int64), view, pixel, sigma_px, 1).points[0]
+    solved = _solve(images.views, view, pixel, sigma_px, start) if np.isfinite(start).all() else None
     if solved is None:
         return "the rays of its marks do not intersect in front of all its images"
     position, residual, by_point, by_pose = solved
@@ -120,33 +119,22 @@ def intersect(point: CheckPoint, images: PosedImages) -> Intersection | str:
     return Intersection(position, seen_in, residual_px, residual, by_point, by_poses)
 
 
-def _ideal_marks(marks: Sequence[Mark], cameras: Sequence[Camera]) -> tuple[Array, Array]:
-    """Ideal pixels (m, 2) of marks and whiteners (m, 2, 2): ideal residual -> observed residual in sigmas."""
-    steps = np.array([[0.0, 0.0], [_STEP_PX, 0.0], [-_STEP_PX, 0.0], [0.0, _STEP_PX], [0.0, -_STEP_PX]])
-    ideal, whitener = np.empty((len(marks), 2)), np.empty((len(marks), 2, 2))
-    for i, (mark, camera) in enumerate(zip(marks, cameras, strict=True)):
-        moved = ideal_from_observed(camera, np.asarray(mark.pixel, dtype=np.float64) + steps)
-        ideal_by_observed = np.column_stack([moved[1] - moved[2], moved[3] - moved[4]]) / (2.0 * _STEP_PX)
-        ideal[i], whitener[i] = moved[0], np.linalg.inv(ideal_by_observed) / mark.sigma_px
-    return ideal, whitener
-
-
 def _solve(
-    views: Views, view: NDArray[np.int64], ideal: Array, whitener: Array, start: Array
+    views: Views, view: NDArray[np.int64], pixel: Array, sigma_px: Array, start: Array
 ) -> tuple[Array, Array, Array, Array] | None:
     """Gauss-Newton: point (3,), whitened residuals (2m,), derivatives (2m, 3) and (m, 2, 6); None: not determined."""
-    point = start
+    point, whitener = start, 1.0 / sigma_px[:, None]
     for _ in range(_ITERATIONS):
         lin = linearize(views, view, np.tile(point, (len(view), 1)))
         if not np.isfinite(lin.pixel).all():
             return None
-        residual = np.einsum("nij,nj->ni", whitener, lin.pixel - ideal).ravel()
-        by_point = (whitener @ lin.by_point).reshape(-1, 3)
+        residual = (whitener * (lin.pixel - pixel)).ravel()
+        by_point = (whitener[:, None] * lin.by_point).reshape(-1, 3)
         step, _, rank, _ = np.linalg.lstsq(by_point, -residual, rcond=1e-9)
         if rank < 3:
             return None
         # Measured in sigmas of the residuals, so that a far point is not asked for digits that its marks do not hold.
         if np.linalg.norm(by_point @ step) < _CONVERGED:
-            return point, residual, by_point, whitener @ lin.by_pose
+            return point, residual, by_point, whitener[:, None] * lin.by_pose
         point = point + step
     return None

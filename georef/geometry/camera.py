@@ -1,28 +1,37 @@
 """Camera models: pixels <-> rays.
 
-`pinhole` has (fx, fy, cx, cy); `brown` adds (k1, k2, p1, p2), the model of COLMAP's OPENCV and gtsam's Cal3DS2.
-Pixels are of the full-resolution image, the centre of the top-left pixel is (0.5, 0.5). Estimation works on ideal
-pixels: distortion is taken out of an observation once, by `ideal_from_observed`.
+`pinhole` has (fx, fy, cx, cy); `brown` adds (k1, k2, p1, p2[, k3]), the model of COLMAP's OPENCV and gtsam's Cal3DS2;
+`fisheye` is equidistant with (k1, k2, k3, k4), OPENCV_FISHEYE and Cal3Fisheye, to beyond 90 degrees from the axis.
+Pixels are of the full-resolution image, the centre of the top-left pixel is (0.5, 0.5). Estimation works on pixels as
+they were observed: their noise is the same in all directions there, and only there.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Literal, cast
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from georef.geometry.lenses import COEFFICIENTS, MODELS, LensModel, undistort
 from georef.geometry.rigid import Array
 
-CameraModel = Literal["pinhole", "brown"]
-_UNDISTORT_ITERATIONS, _UNDISTORTED = 12, 1e-15
-_SMALLEST_DETERMINANT, _LARGEST_STEP = 1e-3, 0.5  # of Newton's method
+CameraModel = Literal["pinhole", "brown", "fisheye"]
+ESTIMABLE = ("focal", "k1", "k2")
+"""What can be estimated of a camera together with a pose. focal is the logarithm of a factor on fx and fy."""
 
 
 @dataclass(frozen=True)
 class Camera:
-    """Interior orientation, all in pixels of the full-resolution image; `distortion` is (k1, k2, p1, p2) or empty."""
+    """Interior orientation, all in pixels of the full-resolution image.
+
+    distortion: the coefficients of the model, (k1, k2, p1, p2) or (k1, k2, p1, p2, k3) of brown, (k1, k2, k3, k4) of
+    fisheye; missing ones are zero. A model that is not named follows from them: brown with, pinhole without.
+    estimate: which of ESTIMABLE are not known; their values here are where the estimation starts.
+    """
 
     camera_id: str
     width: int
@@ -32,10 +41,36 @@ class Camera:
     cx: float
     cy: float
     distortion: tuple[float, ...] = ()
+    model: CameraModel = "pinhole"
+    estimate: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        has_distortion = self.distortion or {"k1", "k2"} & set(self.estimate)
+        if self.model == "pinhole" and has_distortion:
+            object.__setattr__(self, "model", "brown")
+        if self.model not in MODELS or len(self.distortion) > len(MODELS[self.model].parameters):
+            raise ValueError(f"camera {self.camera_id!r}: {self.model} has no {len(self.distortion)} coefficients")
+        if set(self.estimate) - set(ESTIMABLE):
+            raise ValueError(f"camera {self.camera_id!r}: only {', '.join(ESTIMABLE)} can be estimated")
 
     @property
-    def model(self) -> CameraModel:
-        return "brown" if self.distortion else "pinhole"
+    def lens(self) -> LensModel:
+        return MODELS[self.model]
+
+    @property
+    def coefficients(self) -> Array:
+        """The coefficients (5,) of the model, zeros where there are fewer."""
+        return np.array([*self.distortion, *[0.0] * (COEFFICIENTS - len(self.distortion))])
+
+    @cached_property
+    def limit(self) -> float:
+        """Up to where the model has an inverse: the tangent (pinhole, brown) or angle (fisheye) from the axis."""
+        return self.lens.limit(self.coefficients)
+
+    @cached_property
+    def parameters(self) -> Array:
+        """All of them in one row (10,): fx, fy, cx, cy, five coefficients, limit."""
+        return np.array([self.fx, self.fy, self.cx, self.cy, *self.coefficients, self.limit])
 
     @property
     def matrix(self) -> Array:
@@ -44,73 +79,99 @@ class Camera:
 
     @property
     def half_view_angle_rad(self) -> float:
-        """Largest angle between the optical axis and a ray through an image corner."""
-        corners = np.array([[0, 0], [self.width, 0], [0, self.height], [self.width, self.height]], dtype=float)
-        slopes = np.linalg.norm((corners - [self.cx, self.cy]) / [self.fx, self.fy], axis=1)
-        return float(np.arctan(slopes.max()))
+        """Largest angle between the optical axis and a ray through the image's border."""
+        across, down = np.linspace(0, self.width, 33), np.linspace(0, self.height, 33)
+        border = np.array(
+            [(x, y) for x in across for y in (0, self.height)] + [(x, y) for y in down for x in (0, self.width)]
+        )
+        rays = rays_from_pixels(self, border)
+        if not np.isfinite(rays).all():  # the picture's corners lie beyond what the lens shows
+            return self.limit if self.model == "fisheye" else float(np.arctan(self.limit))
+        return float(np.arctan2(np.linalg.norm(rays[:, :2], axis=1), rays[:, 2]).max())
+
+    def value(self, name: str) -> float:
+        """The value of one of ESTIMABLE; focal is fx in pixels."""
+        return self.fx if name == "focal" else float(self.coefficients[self.lens.parameters.index(name)])
+
+    def changed(self, names: Sequence[str], step: ArrayLike) -> Camera:
+        """The camera with a step (q,) added to the named ones of ESTIMABLE."""
+        factor, coefficients = 1.0, self.coefficients
+        for name, change in zip(names, np.asarray(step, dtype=np.float64), strict=True):
+            if name == "focal":
+                factor = float(np.exp(change))
+            else:
+                coefficients[self.lens.parameters.index(name)] += change
+        count = len(self.distortion)
+        if any(name != "focal" for name in names):
+            count = max(count, 4)
+        distortion = tuple(float(v) for v in coefficients[:count])
+        return replace(self, fx=self.fx * factor, fy=self.fy * factor, distortion=distortion)
 
 
 def project(camera: Camera, points_in_cam: ArrayLike) -> Array:
-    """Observed pixels (N, 2) of points (N, 3) in the camera frame; NaN for points that are not in front of it."""
+    """Observed pixels (N, 2) of points (N, 3) in the camera frame; NaN for points that the lens does not show.
+
+    Those are points that are not in front (pinhole, brown), and directions beyond the one at which the distortion
+    folds the image back on itself.
+    """
     points = np.asarray(points_in_cam, dtype=np.float64)
-    depth = np.where(points[..., 2] > 0, points[..., 2], np.nan)
-    slopes = points[..., :2] / depth[..., None]
-    if camera.distortion:
-        slopes = _distort(slopes, camera.distortion)
-    return cast(Array, slopes * [camera.fx, camera.fy] + [camera.cx, camera.cy])
+    image = camera.lens.project(points, camera.coefficients, np.asarray(camera.limit))
+    return cast(Array, image * [camera.fx, camera.fy] + [camera.cx, camera.cy])
+
+
+def rays_from_pixels(camera: Camera, pixels: ArrayLike) -> Array:
+    """Viewing directions (N, 3) in the camera frame of observed pixels (N, 2), to 1e-9 px; NaN where there is none.
+
+    Scaled to z = 1 of pinhole and brown cameras, to unit length of fisheye ones.
+    """
+    image = (np.asarray(pixels, dtype=np.float64) - [camera.cx, camera.cy]) / [camera.fx, camera.fy]
+    return camera.lens.rays(image, camera.coefficients, np.asarray(camera.limit))
+
+
+def ray_derivatives(camera: Camera, rays: Array) -> Array:
+    """Derivatives (N, 3, 2) of `rays_from_pixels` by the pixel, at the rays (N, 3) that it gave."""
+    _, by_point, _ = camera.lens.derivatives(rays, camera.coefficients, np.asarray(camera.limit))
+    by_point = by_point * np.array([camera.fx, camera.fy])[:, None]
+    if camera.model != "fisheye":  # z = 1: the inverse of the derivative by slopes
+        by_pixel = np.zeros((len(rays), 3, 2))
+        by_pixel[:, :2] = _inverse_2x2(by_point[:, :, :2])
+        return by_pixel
+    transposed = np.swapaxes(by_point, 1, 2)  # a unit ray moves across itself, which is the range of this
+    return transposed @ _inverse_2x2(by_point @ transposed)
+
+
+def intrinsic_derivatives(camera: Camera, points_in_cam: Array, names: Sequence[str]) -> Array:
+    """Derivatives (N, 2, q) of the pixels of points (N, 3) by q named ones of ESTIMABLE."""
+    image, _, by_coefficient = camera.lens.derivatives(points_in_cam, camera.coefficients, np.asarray(camera.limit))
+    focal = np.array([camera.fx, camera.fy])
+    columns = [
+        image * focal if name == "focal" else by_coefficient[..., camera.lens.parameters.index(name)] * focal
+        for name in names
+    ]
+    return np.stack(columns, axis=-1) if columns else np.zeros((len(points_in_cam), 2, 0))
 
 
 def ideal_from_observed(camera: Camera, pixels: ArrayLike) -> Array:
-    """Distortion-free pixels (N, 2) of the same calibration matrix, from observed pixels (N, 2).
+    """Distortion-free pixels (N, 2) of the same calibration matrix, from observed pixels (N, 2), for undistorted
+    pictures.
 
-    Newton's method; to 1e-9 px wherever the distortion has an inverse. Beyond the radius at which a strong negative
-    k1 folds the image back on itself it has none: the result there is finite, and `project` does not return the pixel.
+    Beyond the radius at which a strong negative k1 folds the image back on itself the result is finite, and `project`
+    does not return the pixel. NaN for rays of a fisheye that are not in front of the camera.
     """
     observed = np.asarray(pixels, dtype=np.float64)
-    if not camera.distortion:
+    if camera.model == "pinhole":
         return observed
     centre, focal = np.array([camera.cx, camera.cy]), np.array([camera.fx, camera.fy])
-    distorted = (observed - centre) / focal
-    slopes = distorted.copy()
-    for _ in range(_UNDISTORT_ITERATIONS):
-        error = _distort(slopes, camera.distortion) - distorted
-        if np.abs(error).max(initial=0.0) < _UNDISTORTED:
-            break
-        slopes = slopes - _newton_step(slopes, error, camera.distortion)
-    return slopes * focal + centre
+    if camera.model == "brown":
+        return undistort((observed - centre) / focal, camera.coefficients) * focal + centre
+    rays = rays_from_pixels(camera, observed)
+    depth = np.where(rays[..., 2] > 0, rays[..., 2], np.nan)
+    return cast(Array, rays[..., :2] / depth[..., None] * focal + centre)
 
 
-def rays_from_ideal(camera: Camera, ideal_px: ArrayLike) -> Array:
-    """Unit viewing directions (N, 3) in the camera frame of distortion-free pixels (N, 2)."""
-    pixels = np.asarray(ideal_px, dtype=np.float64)
-    slopes = (pixels - [camera.cx, camera.cy]) / [camera.fx, camera.fy]
-    rays = np.concatenate([slopes, np.ones((*slopes.shape[:-1], 1))], axis=-1)
-    return rays / np.linalg.norm(rays, axis=-1, keepdims=True)
-
-
-def _distort(slopes: Array, distortion: tuple[float, ...]) -> Array:
-    k1, k2, p1, p2 = distortion
-    x, y = slopes[..., 0], slopes[..., 1]
-    r2 = x * x + y * y
-    radial = 1.0 + r2 * (k1 + k2 * r2)
-    return np.stack(
-        [
-            x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x),
-            y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y,
-        ],
-        axis=-1,
-    )
-
-
-def _newton_step(slopes: Array, error: Array, distortion: tuple[float, ...]) -> Array:
-    """Change of slopes (N, 2) that removes an error (N, 2) of the distorted slopes; bounded, so as to stay finite."""
-    k1, k2, p1, p2 = distortion
-    x, y = slopes[..., 0], slopes[..., 1]
-    r2 = x * x + y * y
-    radial, radial_rate = 1.0 + r2 * (k1 + k2 * r2), 2.0 * (k1 + 2.0 * k2 * r2)
-    xx = radial + radial_rate * x * x + 2.0 * p1 * y + 6.0 * p2 * x
-    xy = radial_rate * x * y + 2.0 * p1 * x + 2.0 * p2 * y  # the derivative is symmetric
-    yy = radial + radial_rate * y * y + 6.0 * p1 * y + 2.0 * p2 * x
-    determinant = np.maximum(xx * yy - xy * xy, _SMALLEST_DETERMINANT)
-    step = np.stack([yy * error[..., 0] - xy * error[..., 1], xx * error[..., 1] - xy * error[..., 0]], axis=-1)
-    return np.clip(step / determinant[..., None], -_LARGEST_STEP, _LARGEST_STEP)
+def _inverse_2x2(matrices: Array) -> Array:
+    """Inverses of matrices (N, 2, 2), NaN where one is singular or NaN."""
+    a, b, c, d = matrices[:, 0, 0], matrices[:, 0, 1], matrices[:, 1, 0], matrices[:, 1, 1]
+    determinant = a * d - b * c
+    determinant = np.where(determinant != 0, determinant, np.nan)
+    return np.stack([np.stack([d, -b], axis=1), np.stack([-c, a], axis=1)], axis=1) / determinant[:, None, None]

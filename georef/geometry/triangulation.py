@@ -44,9 +44,9 @@ def triangulate(
     sigma_px: Array,
     count: int,
 ) -> Triangulated:
-    """Triangulates `count` points from n observations: point and view index (n,), ideal pixel (n, 2), sigma (n,).
+    """Triangulates `count` points from n observations: point and view index (n,), pixel (n, 2), sigma (n,).
 
-    Points with fewer than two observations, or behind a camera that sees them, are NaN.
+    Points with fewer than two observations, or where a camera that sees them does not show them, are NaN.
     """
     points = _intersect_rays(views, point, view, pixel, count)
     for _ in range(_ITERATIONS - 1):

@@ -4,64 +4,128 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 
-from georef.geometry.camera import Camera
+from georef.geometry.camera import ESTIMABLE, Camera, CameraModel
+from georef.geometry.lenses import MODELS
 from georef.geometry.rigid import Array
 from georef.io.tables import Table, TableFormat, read_table
 
 CAMERA_COLUMNS = ("camera", "width", "height", "fx", "fy", "cx", "cy")
-DISTORTION_COLUMNS = ("k1", "k2", "p1", "p2")
-_UNSUPPORTED = ("k3", "k4", "k5", "k6", "p3", "p4", "b1", "b2", "skew")
-_SHORTEST_FOCAL = 0.1  # of the longer side: a view of 157 degrees, beyond what these camera models describe
+COEFFICIENT_COLUMNS = ("k1", "k2", "p1", "p2", "k3", "k4")
+DEFAULT_FOCAL = 1.2
+"""Of the longer side: where an unknown focal length starts, a view of 45 degrees."""
+_OF_BROWN, _OF_FISHEYE = ("k1", "k2", "p1", "p2", "k3"), ("k1", "k2", "k3", "k4")
+_UNSUPPORTED = ("k5", "k6", "p3", "p4", "b1", "b2", "skew")
+_SHORTEST_FOCAL = 0.1  # of the longer side: a fisheye of more than 360 degrees
 
 
 def read_cameras(
     path: Path | str, *, columns: Mapping[str, str] | None = None, table_format: TableFormat | None = None
 ) -> dict[str, Camera]:
-    """Read camera, width, height, fx, fy, cx, cy and optionally k1, k2, p1, p2 -> camera id: Camera.
+    """Read camera, width, height, fx, fy, cx, cy and optionally model, k1 to k4, p1, p2, estimate -> id: Camera.
 
-    Pixels; the centre of the top-left pixel is (0.5, 0.5). Raises InputError for columns that are missing, values
-    that cannot be (sizes, focal lengths, a principal point outside the image), distortion terms that the model does
-    not have, and cameras that are listed twice.
+    Pixels; the centre of the top-left pixel is (0.5, 0.5). model: pinhole, brown (k1, k2, p1, p2, k3) or fisheye
+    (equidistant, k1 to k4); without it brown where a coefficient is not zero, pinhole elsewhere. estimate: which of
+    focal, k1, k2 are not known, "focal k1"; their values are then where the estimation starts, and may be left out
+    together with the principal point: 1.2 of the longer side, the middle. Raises InputError for columns that are
+    missing, values that cannot be (sizes, focal lengths, a principal point outside the image), coefficients that the
+    model does not have, and cameras that are listed twice.
     """
     table = read_table(path, columns=columns, table_format=table_format)
-    table.require(CAMERA_COLUMNS)
+    unknown = _unknown(table)
+    table.require(CAMERA_COLUMNS if not all("focal" in names for names in unknown) else CAMERA_COLUMNS[:3])
     ids = table.unique_ids("camera")
     sizes = np.stack([table.integers("width"), table.integers("height")], axis=1)
-    focal, principal = table.stack(("fx", "fy")), table.stack(("cx", "cy"))
-    _refuse_unsupported(table)
     _check_sizes(table, ids, sizes)
+    focal = _or_start(table, ("fx", "fy"), unknown, np.repeat(DEFAULT_FOCAL * sizes.max(axis=1, keepdims=True), 2, 1))
+    principal = _or_start(table, ("cx", "cy"), unknown, sizes / 2.0)
+    models, coefficients = _models(table), _coefficients(table)
+    _refuse_unsupported(table, models, coefficients)
     _check_focal_lengths(table, ids, sizes, focal)
     _check_principal_points(table, ids, sizes, principal)
-    distortion = _distortion(table)
     return {
         camera_id: Camera(
             camera_id,
             int(sizes[i, 0]),
             int(sizes[i, 1]),
             *map(float, (*focal[i], *principal[i])),
-            distortion=tuple(map(float, distortion[i])) if np.any(distortion[i]) else (),
+            distortion=_distortion(models[i], {name: float(values[i]) for name, values in coefficients.items()}),
+            model=models[i],
+            estimate=unknown[i],
         )
         for i, camera_id in enumerate(ids)
     }
 
 
-def _distortion(table: Table) -> Array:
-    zeros = np.zeros(len(table))
-    return np.stack([table.numbers(name) if table.has(name) else zeros for name in DISTORTION_COLUMNS], axis=1)
+def _models(table: Table) -> list[CameraModel]:
+    """The model of each camera: as it is named, else as its coefficients and unknowns ask for."""
+    named = table.choices("model", MODELS, allow_empty=True) if table.has("model") else ("",) * len(table)
+    values = _coefficients(table)
+    unknown = _unknown(table)
+    return [
+        cast(CameraModel, name)
+        or ("brown" if any(v[i] for v in values.values()) or {"k1", "k2"} & set(unknown[i]) else "pinhole")
+        for i, name in enumerate(named)
+    ]
 
 
-def _refuse_unsupported(table: Table) -> None:
-    for name in _UNSUPPORTED:
-        values = np.nan_to_num(table.numbers(name, allow_empty=True)) if table.has(name) else np.zeros(0)
-        for i in np.flatnonzero(values)[:1]:
+def _coefficients(table: Table) -> dict[str, Array]:
+    return {
+        name: np.nan_to_num(table.numbers(name, allow_empty=True)) for name in COEFFICIENT_COLUMNS if table.has(name)
+    }
+
+
+def _distortion(model: CameraModel, values: Mapping[str, float]) -> tuple[float, ...]:
+    names = {"pinhole": (), "brown": _OF_BROWN, "fisheye": _OF_FISHEYE}[model]
+    distortion = tuple(values.get(name, 0.0) for name in names)
+    if model == "brown" and distortion[4] == 0.0:
+        return distortion[:4]
+    return distortion
+
+
+def _unknown(table: Table) -> list[tuple[str, ...]]:
+    """What is to be estimated of each camera."""
+    if not table.has("estimate"):
+        return [()] * len(table)
+    out = []
+    for i, cell in enumerate(table.text("estimate")):
+        names = tuple(cell.lower().replace("+", " ").replace(";", " ").split())
+        wrong = [name for name in names if name not in ESTIMABLE]
+        if wrong or len(set(names)) < len(names) or ("k2" in names and "k1" not in names):
+            raise table.error(
+                i,
+                f"Column 'estimate' has {cell!r}.",
+                expected='what is not known of the camera: "focal", "focal k1", "focal k1 k2", "k1", or nothing.',
+                remedy="Correct the value; leave it empty for a camera that is calibrated.",
+            )
+        out.append(names)
+    return out
+
+
+def _or_start(table: Table, names: tuple[str, str], unknown: list[tuple[str, ...]], start: Array) -> Array:
+    """Two columns (N, 2); `start` where a camera of unknown focal length leaves them empty."""
+    if not table.has(*names):
+        return start
+    given = table.stack(names, allow_empty=True)
+    free = np.array(["focal" in names for names in unknown], bool)[:, None] & np.isnan(given)
+    table.take(np.flatnonzero((np.isnan(given) & ~free).any(axis=1))).stack(names)  # raises: not declared unknown
+    return np.where(free, start, given)
+
+
+def _refuse_unsupported(table: Table, models: list[CameraModel], coefficients: Mapping[str, Array]) -> None:
+    others = {n: np.nan_to_num(table.numbers(n, allow_empty=True)) for n in _UNSUPPORTED if table.has(n)}
+    for name, values in {**coefficients, **others}.items():
+        for i in np.flatnonzero(values):
+            if name in MODELS[models[i]].parameters:
+                continue
             raise table.error(
                 int(i),
-                f"Column {name!r} has {values[i]}, which the camera model here does not have.",
-                expected="no distortion, or the brown model with k1, k2, p1, p2.",
-                remedy=f"Calibrate with {name} fixed at 0, or undistort the images and leave distortion out.",
+                f"Column {name!r} has {values[i]}, which the camera model {models[i]!r} does not have.",
+                expected="pinhole: no distortion; brown: k1, k2, p1, p2, k3; fisheye: k1, k2, k3, k4.",
+                remedy=f"Calibrate with {name} fixed at 0, or name the right model in a column 'model'.",
             )
 
 

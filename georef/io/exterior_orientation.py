@@ -31,11 +31,13 @@ class ExteriorOrientationTable(PositionTable):
     """Poses of N images in CRS axes: see PositionTable, and
 
     axes_from_cam: camera (x right, y down, z forward) to the axes that the angles refer to (E, N, up or x, y, z);
-    intrinsics: fx, fy, cx, cy in pixels of each image; the sigmas are rows of NaN for images without.
+    intrinsics: fx, fy, cx, cy in pixels of each image; the sigmas are rows of NaN for images without;
+    cameras: the id of each image's camera, empty where none is named.
     """
 
     image_ids: tuple[str, ...]
     axes_from_cam: Array  # (N, 3, 3)
+    cameras: tuple[str, ...]
     intrinsics: Array | None = None  # (N, 4) px
     position_sigmas_m: Array | None = None  # (N, 3) m along the axes of the CRS
     angle_sigmas_rad: Array | None = None  # (N, 3) rad, of the angles in the order of their columns
@@ -50,7 +52,7 @@ def read_exterior_orientation(
     columns: Mapping[str, str] | None = None,
     table_format: TableFormat | None = None,
 ) -> ExteriorOrientationTable:
-    """Read image, position, angles, optionally fx, fy, cx, cy (px), sigmas of position (m) and angles (`angle_unit`).
+    """Read image, position, angles, optionally fx, fy, cx, cy (px), camera, sigmas of position (m) and of the angles.
 
     The convention and the unit of the angles are asked for, never guessed. Raises InputError for columns that are
     missing, values that cannot be, images listed twice, and comments that declare other angles than asked for.
@@ -77,6 +79,7 @@ def exterior_orientation_from_table(
         positions_in_crs=read_positions(table, crs_kind),
         image_ids=image_ids,
         axes_from_cam=np.array([_TO_ROTATION[angles](row) for row in angles_rad]).reshape(-1, 3, 3),
+        cameras=table.text("camera") if table.has("camera") else ("",) * len(table),
         intrinsics=_intrinsics(table),
         position_sigmas_m=_sigmas(table, image_ids, SIGMA_COLUMNS[crs_kind], "metres"),
         angle_sigmas_rad=None if angle_sigmas is None else angle_sigmas * to_rad,

@@ -17,12 +17,14 @@ from georef.io.tables import Table, TableFormat, read_table
 class GnssTable(PositionTable):
     """Measured positions of N images: see PositionTable, and
 
-    heading_deg: of the optical axis, clockwise from north, NaN where it is empty or the file has no such column.
+    heading_deg: of the optical axis, clockwise from north, NaN where it is empty or the file has no such column;
+    cameras: the id of each image's camera, empty where none is named.
     """
 
     image_ids: tuple[str, ...]
     sigmas_m: Array  # (N, 3) m along the axes of the CRS (geographic: east, north, up)
     heading_deg: Array  # (N,)
+    cameras: tuple[str, ...]
 
 
 def read_gnss(
@@ -32,7 +34,7 @@ def read_gnss(
     columns: Mapping[str, str] | None = None,
     table_format: TableFormat | None = None,
 ) -> GnssTable:
-    """Read image, position, three sigmas (m) and optionally heading_deg.
+    """Read image, position, three sigmas (m) and optionally heading_deg and camera.
 
     Raises InputError for columns that are missing, values that cannot be, sigmas that are not positive, and images
     that are listed twice.
@@ -54,6 +56,7 @@ def read_gnss(
             remedy=lambda _: "Correct the value, or delete the row if the image has no GNSS position.",
         ),
         heading_deg=_headings(table),
+        cameras=table.text("camera") if table.has("camera") else ("",) * len(table),
     )
 
 

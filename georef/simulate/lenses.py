@@ -70,7 +70,8 @@ class Lens:
         """Unit viewing directions (N, 3) in the camera frame of observed pixels (N, 2)."""
         observed = np.asarray(pixels, dtype=np.float64)
         if self.camera is not None:
-            return pinhole.rays_from_ideal(self.camera, pinhole.ideal_from_observed(self.camera, observed))
+            rays = pinhole.rays_from_pixels(self.camera, observed)
+            return rays / np.linalg.norm(rays, axis=-1, keepdims=True)
         fisheye = cast(Fisheye, self.fisheye)
         offset = (observed - [fisheye.cx, fisheye.cy]) / fisheye.focal_px
         radius = np.linalg.norm(offset, axis=-1)

@@ -18,7 +18,7 @@ from georef.simulate.world import WorldImage
 _CRS_LINE = "# CRS: EPSG:25832, height: ellipsoidal GRS80, metres."
 _SIGMAS = " 1-sigma columns in metres."
 _ANGLES = " Angles: degrees, R = Rx(omega) Ry(phi) Rz(kappa), image (right, top, back) to grid (E, N, up)."
-_PIXELS = "# Pixels; the top-left pixel's centre is (0.5, 0.5)."
+PIXELS = "# Pixels; the top-left pixel's centre is (0.5, 0.5)."
 
 
 def table(comment: str, header: str, rows: Sequence[Sequence[object]]) -> str:
@@ -30,23 +30,30 @@ def camera_table(cameras: Sequence[Camera]) -> str:
         (c.camera_id, c.width, c.height, *(f"{v:.4f}" for v in (c.fx, c.fy, c.cx, c.cy)), *_distortion(c))
         for c in cameras
     ]
-    return table(_PIXELS, "camera,width,height,fx,fy,cx,cy,k1,k2,p1,p2", rows)
+    return table(PIXELS, "camera,width,height,fx,fy,cx,cy,k1,k2,p1,p2", rows)
 
 
 def _distortion(camera: Camera) -> tuple[float, ...]:
     return camera.distortion or (0.0, 0.0, 0.0, 0.0)
 
 
-def orientation_table(poses: Mapping[str, Rigid3], lenses: Mapping[str, Lens], frame: WorldFrame) -> str:
-    """Exterior orientation, with the interior one of images whose lens (by image id) is a pinhole."""
+def orientation_table(
+    poses: Mapping[str, Rigid3],
+    lenses: Mapping[str, Lens],
+    frame: WorldFrame,
+    cameras: Mapping[str, str] | None = None,
+) -> str:
+    """Exterior orientation, with the interior one of images whose lens (by image id) is a pinhole, or camera ids."""
     positions = frame.crs_from_world(np.array([pose.translation for pose in poses.values()]))
     turns = frame.crs_axes_from_world(positions)
     rows = []
     for (name, pose), position, turn in zip(poses.items(), positions, turns, strict=True):
         angles = np.degrees(omega_phi_kappa_from_rotation(turn @ pose.rotation))
         intrinsics = [f"{v:.4f}" for v in _intrinsics(lenses[name])] if lenses else []
-        rows.append((name, *coordinates(position), *(f"{v:.8f}" for v in angles), *intrinsics))
+        camera = [cameras[name]] if cameras else []
+        rows.append((name, *coordinates(position), *(f"{v:.8f}" for v in angles), *intrinsics, *camera))
     header = "image,easting,northing,height,omega,phi,kappa" + (",fx,fy,cx,cy" if lenses else "")
+    header += ",camera" if cameras else ""
     return table(_CRS_LINE + _ANGLES, header, rows)
 
 
@@ -74,6 +81,23 @@ def gnss_table(images: Sequence[WorldImage], measured: Measured, frame: WorldFra
     return table(_CRS_LINE + _SIGMAS + " Headings: degrees clockwise from true north.", header, rows)
 
 
+def position_table(
+    positions_in_world: Mapping[str, Array],
+    sigmas_m: Sequence[float],
+    headings_deg: Sequence[float],
+    cameras: Mapping[str, str],
+    frame: WorldFrame,
+) -> str:
+    """Positions of images with one sigma for all, headings, and camera ids where there are any."""
+    positions = frame.crs_from_world(np.array(list(positions_in_world.values())))
+    rows = []
+    for name, position, heading in zip(positions_in_world, positions, headings_deg, strict=True):
+        camera = [cameras[name]] if cameras else []
+        rows.append((name, *(f"{v:.3f}" for v in (*position, *sigmas_m)), f"{heading:.2f}", *camera))
+    header = "image,easting,northing,height,sigma_e,sigma_n,sigma_h,heading_deg" + (",camera" if cameras else "")
+    return table(_CRS_LINE + _SIGMAS + " Headings: degrees clockwise from true north.", header, rows)
+
+
 def point_table(points: Sequence[SurveyedPoint], frame: WorldFrame) -> str:
     positions = frame.crs_from_world(np.array([point.given for point in points]).reshape(-1, 3))
     rows = [
@@ -86,7 +110,7 @@ def point_table(points: Sequence[SurveyedPoint], frame: WorldFrame) -> str:
 
 def mark_table(marks: Sequence[SurveyMark]) -> str:
     rows = [(m.point_id, m.image_id, f"{m.pixel[0]:.3f}", f"{m.pixel[1]:.3f}", m.sigma_px) for m in marks]
-    return table(_PIXELS, "point,image,x,y,sigma_px", rows)
+    return table(PIXELS, "point,image,x,y,sigma_px", rows)
 
 
 def exact_table(positions_in_world: Mapping[str, Array], frame: WorldFrame) -> str:
@@ -99,4 +123,4 @@ def exact_table(positions_in_world: Mapping[str, Array], frame: WorldFrame) -> s
 def tie_table(ties: Sequence[TiePoint]) -> str:
     """Exact pixels of tie points in all images."""
     rows = [(t.point_id, name, f"{x:.4f}", f"{y:.4f}") for t in ties for name, (x, y) in t.pixels.items()]
-    return table(_PIXELS, "point,image,x,y", rows)
+    return table(PIXELS, "point,image,x,y", rows)

@@ -12,6 +12,7 @@ from georef.features.base import Extractor, extract_features
 from georef.features.images import UnreadableImage, read_image
 from georef.features.registry import EXTRACTORS, load_component
 from georef.stages.base import StageContext, StageSummary, feature_id
+from georef.stages.panoramas import cut_missing
 from georef.store.feature_store import FeatureStore
 from georef.types.campaign import Image
 from georef.types.results import RejectReason
@@ -46,6 +47,7 @@ class ExtractTask:
 def run(context: StageContext) -> StageSummary:
     """Extracts what is not yet in the store; an image that cannot be read is listed, never fatal."""
     images = [*context.survey.reference.images, *context.survey.epoch.images]
+    uncut = cut_missing(context.survey.cutouts, context.executor)
     version = extractor_version(context.config.features)
     folder = context.before["store"]
     store = FeatureStore(folder, extractor_version=version)
@@ -56,6 +58,7 @@ def run(context: StageContext) -> StageSummary:
         for image, failure in zip(pending, context.executor.map_items(task, pending, "features"), strict=True)
         if failure is not None
     }
+    failed |= {feature_id(image): uncut[image.path] for image in images if image.path in uncut}
     line = f"{len(images) - len(failed)} of {len(images)} images have features"
     unreadable = f"; not usable: {', '.join(sorted(failed))}" if failed else ""
     return StageSummary(line + unreadable, {"failed": failed}, len(pending) - len(failed), len(images))

@@ -50,9 +50,10 @@ class LocalizeTask:
     @cached_property
     def map(self) -> ReferenceMap:
         store = open_features(self.store_folder)
+        keys = {image.image_id: feature_id(image) for image in self.reference.images}
 
         def read(image_id: str, count: int | None) -> Features:
-            return store.read(f"{self.reference.epoch}/{image_id}", count)
+            return store.read(keys[image_id], count)
 
         return ReferenceMap(self.reference, read, self.noise)
 

@@ -18,7 +18,6 @@ from georef.estimation.reference_network import (
 )
 from georef.geometry.rigid import Rigid3
 from georef.io.files import write_text_atomically
-from georef.project import ReferenceSigma
 from georef.stages.base import StageContext, StageSummary, feature_id, open_features
 from georef.types.campaign import Image
 from georef.types.results import ReferenceNoise
@@ -44,7 +43,7 @@ def run(context: StageContext) -> StageSummary:
         config.localize.guided_gate, config.localize.guided_min_similarity, config.localize.guided_ratio
     )
     matches = match_network(posed, config.network.neighbours, options, context.executor.progress)
-    result = estimate_noise(posed, matches, config.network, config.adjust, _declared(context))
+    result = estimate_noise(posed, matches, config.network, config.adjust, declared_noise(chosen))
     suspects = [chosen[i].image_id for i in result.suspects]
     data = _as_data(result, suspects)
     write_text_atomically(json.dumps(data, indent=1), context.folder / RESULT)
@@ -93,12 +92,25 @@ def _positions(images: list[Image]) -> np.ndarray:
     return np.array([_pose(image).translation for image in images])
 
 
-def _declared(context: StageContext) -> ReferenceNoise | None:
-    sigma = context.project.file.reference.sigma
-    if not isinstance(sigma, ReferenceSigma):
+def declared_noise(images: list[Image]) -> ReferenceNoise | None:
+    """The declared sigmas of reference images: the root mean square where epochs differ; None if not declared.
+
+    Localization takes each image's own (`ReferenceMap.pose_cov`); the network, which only weighs them against the
+    noise of keypoints, takes these for all.
+    """
+    given = [image.given_sigma for image in images if image.given_sigma is not None]
+    if len(given) < len(images):
         return None
-    x, y, z = np.radians(sigma.rotation_deg)
-    return ReferenceNoise(START_KEYPOINT, sigma.position_m, (float(x), float(y), float(z)), "declared")
+    if len(set(given)) == 1:
+        position, rotation = given[0].position_m, given[0].rotation_rad
+    else:
+        position, rotation = _rms([s.position_m for s in given]), _rms([s.rotation_rad for s in given])
+    return ReferenceNoise(START_KEYPOINT, position, rotation, "declared")
+
+
+def _rms(values: list[tuple[float, float, float]]) -> tuple[float, float, float]:
+    x, y, z = (float(v) for v in np.sqrt(np.mean(np.square(values), axis=0)))
+    return x, y, z
 
 
 def _as_data(result: NetworkResult, suspects: list[str]) -> dict:

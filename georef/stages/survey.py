@@ -4,27 +4,28 @@ from __future__ import annotations
 
 import logging
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import cast
 
 import numpy as np
 
 from georef.crs import CrsDefinition, WorldFrame, check_area_of_use, choose_origin, crs_kind
-from georef.errors import CrsError, InputError
+from georef.errors import CrsError
 from georef.geometry.camera import Camera
-from georef.geometry.rigid import Array, Rigid3, nearest_rotation
-from georef.io.camera_table import read_cameras
 from georef.io.columns import CrsKind, PositionTable
-from georef.io.exterior_orientation import ExteriorOrientationTable, read_exterior_orientation
 from georef.io.gnss import GnssTable, read_gnss
 from georef.io.marks import check_marks, read_marks
 from georef.io.points import read_points
-from georef.io.tables import TableFormat, check_declared_crs, check_declared_height
-from georef.project import Project, TableSection
+from georef.io.tables import check_declared_crs, check_declared_height
+from georef.project import Project
+from georef.stages.cameras import CameraTable, Stated, unknown_camera, with_unknown
+from georef.stages.panoramas import CutOut, placeholder, with_heads
+from georef.stages.reference import image_files, read_orientations, reference_campaign, table_format, world_poses
 from georef.types.campaign import Campaign, Image, PositionPrior
 from georef.types.constraints import CheckKind, CheckPoint, ControlPoint, Mark
 
-IMAGE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff"})
+__all__ = ["Survey", "load_survey", "world_poses"]
 logger = logging.getLogger(__name__)
 
 
@@ -37,56 +38,37 @@ class Survey:
     epoch: Campaign
     control: tuple[ControlPoint, ...]
     check: tuple[CheckPoint, ...]
+    cutouts: tuple[CutOut, ...] = ()  # of panoramas: images that are made from others when they are first needed
+
+    def source_of(self, image: Image) -> Path:
+        """The file that an image comes from: its own, or that of the panorama which it is cut from."""
+        return self._sources.get(image.path, image.path)
+
+    @cached_property
+    def _sources(self) -> dict[Path, Path]:
+        return {cutout.path: cutout.source for cutout in self.cutouts}
 
 
 def load_survey(project: Project, epoch: str) -> Survey:
     """Reads and cross-checks all tables of an epoch. Raises InputError or CrsError with file, row, value, remedy."""
     definition = CrsDefinition(project.file.crs.horizontal, project.file.crs.height)
     kind = cast(CrsKind, crs_kind(definition))
-    orientation = _read_orientation(project, definition, kind)
+    orientations = read_orientations(project, definition, kind)
+    for orientation in orientations.values():
+        check_frame(orientation, definition)
     origin = project.file.crs.origin
-    world = WorldFrame.create(
-        definition, choose_origin(definition, orientation.positions_in_crs) if origin is None else np.array(origin)
-    )
-    reference = _reference(project, orientation, world)
-    new = _epoch(project, epoch, definition, kind, world)
+    if origin is None:
+        everything = np.concatenate([orientation.positions_in_crs for orientation in orientations.values()])
+        world = WorldFrame.create(definition, choose_origin(definition, everything))
+    else:
+        world = WorldFrame.create(definition, np.array(origin))
+    reference, reference_cutouts = reference_campaign(project, orientations, world)
+    new, new_cutouts = _epoch(project, epoch, definition, kind, world)
     control, check = _points(project, epoch, definition, kind, world, new)
-    return Survey(world, reference, new, control, check)
+    return Survey(world, reference, new, control, check, (*reference_cutouts, *new_cutouts))
 
 
-def table_format(section: TableSection) -> TableFormat:
-    return TableFormat(section.delimiter, section.decimal, section.encoding)
-
-
-def world_poses(world: WorldFrame, positions_in_crs: Array, axes_from_cam: Array) -> list[Rigid3]:
-    """world_from_cam of positions (N, 3) and rotations (N, 3, 3)."""
-    centres = world.world_from_crs(positions_in_crs)
-    turns = world.crs_axes_from_world(positions_in_crs)
-    return [Rigid3(nearest_rotation(t.T @ r), c) for t, r, c in zip(turns, axes_from_cam, centres, strict=True)]
-
-
-def _read_orientation(project: Project, definition: CrsDefinition, kind: CrsKind) -> ExteriorOrientationTable:
-    section = project.file.reference
-    table = read_exterior_orientation(
-        project.data(section.exterior_orientation),
-        crs_kind=kind,
-        angles=section.angles,
-        angle_unit=section.angle_unit,
-        columns=section.table.columns or None,
-        table_format=table_format(section.table),
-    )
-    _check_frame(table, definition)
-    if len(table) < 2:
-        raise InputError(
-            f"The reference has {len(table)} images.",
-            expected="at least two, better ten about each place.",
-            remedy="Add reference images with their exterior orientation.",
-            path=table.path,
-        )
-    return table
-
-
-def _check_frame(table: PositionTable, definition: CrsDefinition) -> None:
+def check_frame(table: PositionTable, definition: CrsDefinition) -> None:
     """The file's declared CRS against the project's, and the coordinates against the area of use."""
     check_declared_crs(table, definition.horizontal)
     if definition.height is not None:
@@ -97,130 +79,57 @@ def _check_frame(table: PositionTable, definition: CrsDefinition) -> None:
         raise CrsError(str(error), f"In {table.path}.") from None
 
 
-def _reference(project: Project, orientation: ExteriorOrientationTable, world: WorldFrame) -> Campaign:
-    section = project.file.reference
-    folder = project.data(section.images)
-    files = _image_files(folder)
-    _match_images(orientation, files, folder, skip=section.unmatched == "skip")
-    cameras = None
-    if section.cameras:
-        cameras_path = project.data(section.cameras)
-        cameras = read_cameras(cameras_path), cameras_path
-    poses = world_poses(world, orientation.positions_in_crs, orientation.axes_from_cam)
-    images = []
-    for index, (name, pose) in enumerate(zip(orientation.image_ids, poses, strict=True)):
-        if name in files:
-            camera = _camera(orientation, index, cameras, files[name], name)
-            images.append(Image(name, files[name], camera, "reference", world_from_cam=pose))
-    return Campaign("reference", tuple(images))
-
-
-def _match_images(orientation: ExteriorOrientationTable, files: dict[str, Path], folder: Path, *, skip: bool) -> None:
-    """Poses without an image and images without a pose: refused, or skipped with a warning where that is declared."""
-    remedy = 'or set unmatched = "skip" in section [reference] of project.toml.'
-    for name, row in zip(orientation.image_ids, orientation.rows, strict=True):
-        if name not in files:
-            problem = f"Reference image '{name}' has an exterior orientation but no file in {folder}."
-            if not skip:
-                raise InputError(
-                    problem, remedy=f"Add the image, remove the row, {remedy}", path=orientation.path, row=int(row)
-                )
-            logger.warning("%s", problem)
-    extra = sorted(set(files) - set(orientation.image_ids))
-    if extra:
-        problem = f"{len(extra)} images in {folder} have no exterior orientation, the first is '{extra[0]}'."
-        if not skip:
-            raise InputError(problem, remedy=f"Add their rows, move them away, {remedy}", path=orientation.path)
-        logger.warning("%s", problem)
-
-
-def _image_files(folder: Path) -> dict[str, Path]:
-    if not folder.is_dir():
-        raise InputError(
-            "The folder of images does not exist.",
-            remedy="Correct `images` in project.toml, or the folder of the data (--data or GEOREF_DATA).",
-            path=folder,
-        )
-    files = sorted(p for p in folder.rglob("*") if p.suffix.lower() in IMAGE_SUFFIXES and p.is_file())
-    if not files:
-        raise InputError("The folder holds no images.", expected="JPEG, PNG or TIFF files.", path=folder)
-    return {p.relative_to(folder).as_posix(): p for p in files}
-
-
-def _camera(
-    orientation: ExteriorOrientationTable,
-    index: int,
-    cameras: tuple[dict[str, Camera], Path] | None,
-    path: Path,
-    name: str,
-) -> Camera:
-    """The camera of an image: from its own intrinsics columns, else the only or the named one of the camera table."""
-    if orientation.intrinsics is not None:
-        fx, fy, cx, cy = (float(v) for v in orientation.intrinsics[index])
-        width, height = _image_size(path)
-        return Camera(name, width, height, fx, fy, cx, cy)
-    if cameras is None:
-        raise InputError(
-            "There is no interior orientation for the reference images.",
-            expected="columns fx, fy, cx, cy beside the exterior orientation, or a camera table.",
-            remedy='Name one in project.toml: [reference] cameras = "camera.csv".',
-            path=orientation.path,
-        )
-    return single_camera(*cameras)
-
-
-def single_camera(cameras: dict[str, Camera], path: Path) -> Camera:
-    """The only camera of a table."""
-    if len(cameras) != 1:
-        raise InputError(
-            f"The camera table has {len(cameras)} cameras: {', '.join(list(cameras)[:5])}.",
-            expected="one camera that took all images of the epoch.",
-            remedy="Give each camera's images an epoch of their own.",
-            path=path,
-        )
-    return next(iter(cameras.values()))
-
-
-def _image_size(path: Path) -> tuple[int, int]:
-    from PIL import Image as PillowImage
-
-    with PillowImage.open(path) as image:
-        return image.size
-
-
-def _epoch(project: Project, epoch: str, definition: CrsDefinition, kind: CrsKind, world: WorldFrame) -> Campaign:
+def _epoch(
+    project: Project, epoch: str, definition: CrsDefinition, kind: CrsKind, world: WorldFrame
+) -> tuple[Campaign, list[CutOut]]:
     """All images of the folder and all rows of the GNSS table: each will have an outcome."""
     section = project.file.epochs[epoch]
     folder = project.data(section.images)
-    files = _image_files(folder)
-    camera = single_camera(read_cameras(project.data(section.cameras)), project.data(section.cameras))
-    images = {name: Image(name, path, camera, epoch) for name, path in files.items()}
-    if section.gnss is None:
-        return Campaign(epoch, tuple(images.values()))
-    gnss = read_gnss(
-        project.data(section.gnss),
-        crs_kind=kind,
-        columns=section.table.columns or None,
-        table_format=table_format(section.table),
-    )
-    _check_frame(gnss, definition)
-    for name, prior, heading in zip(gnss.image_ids, _priors(gnss, world), gnss.heading_deg, strict=True):
-        image = images.get(name, Image(name, folder / name, camera, epoch))
-        heading_rad = None if np.isnan(heading) else float(np.radians(heading))
-        images[name] = replace(image, gnss=prior, heading_rad=heading_rad)
-    without = [name for name, image in images.items() if image.gnss is None]
-    if without:
-        logger.warning("%d images of epoch %s have no GNSS position, the first is %s", len(without), epoch, without[0])
-    return Campaign(epoch, tuple(images[name] for name in sorted(images)))
+    files, stated, priors = image_files(folder), Stated(), {}
+    if section.gnss is not None:
+        gnss = read_gnss(
+            project.data(section.gnss),
+            crs_kind=kind,
+            columns=section.table.columns or None,
+            table_format=table_format(section.table),
+        )
+        check_frame(gnss, definition)
+        stated = Stated.of(gnss.path, gnss.image_ids, gnss.cameras, gnss.rows.tolist())
+        priors = dict(zip(gnss.image_ids, _priors(gnss, world), strict=True))
+        files |= {name: folder / name for name in gnss.image_ids if name not in files}
+        without = [name for name in files if name not in priors]
+        if without:
+            message = "%d images of epoch %s have no GNSS position, the first is %s"
+            logger.warning(message, len(without), epoch, without[0])
+    table = None if section.cameras is None else CameraTable.read(project.data(section.cameras))
+    images = []
+    for name, path in sorted(files.items()):
+        image = placeholder(name, path, epoch)
+        if section.panorama is None:
+            image = replace(image, camera=_new_camera(name, path, table, stated, section.unknown))
+        prior, heading_rad = priors.get(name, (None, None))
+        images.append(replace(image, gnss=prior, heading_rad=heading_rad))
+    return with_heads(project, epoch, images, section.panorama)
 
 
-def _priors(gnss: GnssTable, world: WorldFrame) -> list[PositionPrior]:
+def _new_camera(name: str, path: Path, table: CameraTable | None, stated: Stated, unknown: tuple[str, ...]) -> Camera:
+    """The camera of a new image: of the table, or unknown, or both."""
+    if table is None:
+        return unknown_camera(path, unknown)
+    return with_unknown(table.camera_of(name, stated), unknown, path)
+
+
+def _priors(gnss: GnssTable, world: WorldFrame) -> list[tuple[PositionPrior, float | None]]:
+    """Position and heading (rad, None where there is none) of each row."""
     covs = np.zeros((len(gnss), 3, 3))
     covs[:, range(3), range(3)] = np.square(gnss.sigmas_m)
     positions = world.world_from_crs(gnss.positions_in_crs)
+    headings = [None if np.isnan(heading) else float(np.radians(heading)) for heading in gnss.heading_deg]
     return [
-        PositionPrior(p, c)
-        for p, c in zip(positions, world.world_cov_from_crs(gnss.positions_in_crs, covs), strict=True)
+        (PositionPrior(p, c), heading)
+        for p, c, heading in zip(
+            positions, world.world_cov_from_crs(gnss.positions_in_crs, covs), headings, strict=True
+        )
     ]
 
 
@@ -236,7 +145,7 @@ def _points(
         columns=section.table.columns or None,
         table_format=table_format(section.table),
     )
-    _check_frame(table, definition)
+    check_frame(table, definition)
     marks = read_marks(project.data(section.marks[epoch]), repeats="mean", table_format=table_format(section.table))
     check_marks(marks, table.point_ids, {i.image_id: (i.camera.width, i.camera.height) for i in new.images})
     by_point: dict[str, list[Mark]] = {}

@@ -33,6 +33,14 @@ class PosePrior:
         require_covariance(self.cov, 6)
 
 
+@dataclass(frozen=True)
+class PoseSigma:
+    """Given 1-sigma of a reference pose: of its position east, north, up, and of its rotation about the camera axes."""
+
+    position_m: tuple[float, float, float]
+    rotation_rad: tuple[float, float, float]
+
+
 @dataclass(frozen=True, eq=False)
 class Image:
     """One photograph: where its file lies, its camera, and what is known of its pose."""
@@ -44,6 +52,7 @@ class Image:
     world_from_cam: Rigid3 | None = None  # reference images: the given exterior orientation
     gnss: PositionPrior | None = None
     heading_rad: float | None = None  # of the optical axis, clockwise from the world's north
+    given_sigma: PoseSigma | None = None  # of world_from_cam, where the project declares it
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,7 +14,7 @@ from georef.geometry.rigid import Array
 class Observations:
     """Image observations of points, in any order: row i is one point seen in one view.
 
-    Pixels are ideal (distortion removed) full-resolution pixels.
+    Pixels are observed full-resolution pixels.
     """
 
     point: NDArray[np.int64]  # (n,) index of the point

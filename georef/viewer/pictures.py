@@ -46,7 +46,7 @@ def picture_jpeg(path: Path, camera: Camera, small: SmallPinhole) -> bytes | Non
     except (OSError, ValueError, InputError) as error:
         logger.warning("no picture of %s in the recording: %s", path.name, error)
         return None
-    if camera.distortion:
+    if camera.model != "pinhole":
         pixels = _undistorted(pixels, camera, small)
     buffer = io.BytesIO()
     PillowImage.fromarray(pixels).save(buffer, "JPEG", quality=_JPEG_QUALITY)

@@ -12,16 +12,22 @@ import pycolmap
 import pytest
 from scipy.spatial.transform import Rotation
 
+from georef.estimation.colmap import colmap_camera
 from georef.evaluation.statistics import summarize_nees
 from georef.geometry.angles import rotation_from_omega_phi_kappa, rotation_from_yaw_pitch_roll
-from georef.geometry.camera import Camera, ideal_from_observed, project
+from georef.geometry.camera import Camera, intrinsic_derivatives, project, rays_from_pixels
 from georef.geometry.covariance import world_from_cam_cov_from_colmap
 from georef.geometry.projection import Views, linearize
 from georef.geometry.rigid import Array, Rigid3, exp_so3, log_so3, right_jacobian_so3
 
 _PINHOLE = Camera("pinhole", 4000, 3000, 2510.0, 2495.0, 2003.5, 1496.5)
 _BROWN = Camera("brown", 4000, 3000, 2510.0, 2495.0, 2003.5, 1496.5, (-0.12, 0.03, 4e-4, -7e-4))
-_CAMERAS = pytest.mark.parametrize("camera", [_PINHOLE, _BROWN], ids=["pinhole", "brown"])
+_FISHEYE = Camera("fisheye", 4000, 3000, 1310.0, 1305.0, 2003.5, 1496.5, (-0.02, 4e-3, -1e-3, 1e-4), "fisheye")
+_K3 = Camera("k3", 4000, 3000, 2510.0, 2495.0, 2003.5, 1496.5, (-0.22, 0.06, 4e-4, -7e-4, 0.01))
+_CAMERAS = pytest.mark.parametrize("camera", [_PINHOLE, _BROWN, _FISHEYE], ids=["pinhole", "brown", "fisheye"])
+_WITH_K3 = pytest.mark.parametrize(
+    "camera", [_PINHOLE, _BROWN, _FISHEYE, _K3], ids=["pinhole", "brown", "fisheye", "k3"]
+)
 _WORLD_FROM_CAM = Rigid3.exp([0.4, -1.1, 0.7, 120.0, -50.0, 30.0])
 _XI = np.array([0.3, -0.8, 0.5, 2.0, -1.0, 0.7])
 
@@ -32,45 +38,42 @@ def points_in_world() -> Array:
     return _WORLD_FROM_CAM.apply(np.column_stack([slopes, np.ones(40)]) * rng.uniform(2.0, 60.0, (40, 1)))
 
 
-def colmap_camera(camera: Camera) -> Any:
-    model = "OPENCV" if camera.distortion else "PINHOLE"
-    params = [camera.fx, camera.fy, camera.cx, camera.cy, *camera.distortion]
-    return pycolmap.Camera(model=model, width=camera.width, height=camera.height, params=params)
-
-
 def gtsam_camera(camera: Camera, world_from_cam: Rigid3) -> Any:
-    pose, (k1, k2, p1, p2) = gtsam.Pose3(world_from_cam.matrix()), camera.distortion or (0.0, 0.0, 0.0, 0.0)
-    if not camera.distortion:
-        k = gtsam.Cal3_S2(camera.fx, camera.fy, 0.0, camera.cx, camera.cy)
-        return gtsam.PinholeCameraCal3_S2(pose, k)
-    k = gtsam.Cal3DS2(camera.fx, camera.fy, 0.0, camera.cx, camera.cy, k1, k2, p1, p2)
-    return gtsam.PinholeCameraCal3DS2(pose, k)
+    pose, pinhole = gtsam.Pose3(world_from_cam.matrix()), (camera.fx, camera.fy, 0.0, camera.cx, camera.cy)
+    if camera.model == "pinhole":
+        return gtsam.PinholeCameraCal3_S2(pose, gtsam.Cal3_S2(*pinhole))
+    if camera.model == "brown":
+        return gtsam.PinholeCameraCal3DS2(pose, gtsam.Cal3DS2(*pinhole, *camera.distortion))
+    return gtsam.PinholeCameraCal3Fisheye(pose, gtsam.Cal3Fisheye(*pinhole, *camera.distortion))
 
 
 # --- one point, four libraries --------------------------------------------------------------------
 
 
-@_CAMERAS
+@_WITH_K3
 def test_the_same_pixel_as_colmap(camera: Camera) -> None:
     cam_from_world = _WORLD_FROM_CAM.inverse()
     pose = pycolmap.Rigid3d(pycolmap.Rotation3d(cam_from_world.rotation), cam_from_world.translation)
     in_cam = np.array([pose * point for point in points_in_world()])
     pixels = colmap_camera(camera).img_from_cam(in_cam)
     np.testing.assert_allclose(project(camera, cam_from_world.apply(points_in_world())), pixels, atol=1e-9)
-    rays = colmap_camera(camera).cam_from_img(pixels)
-    ideal = rays * [camera.fx, camera.fy] + [camera.cx, camera.cy]
-    np.testing.assert_allclose(
-        ideal_from_observed(camera, pixels), ideal, atol=1e-6
-    )  # COLMAP stops at 1e-10 of a slope
+    rays = rays_from_pixels(camera, pixels)
+    slopes = rays[:, :2] / rays[:, 2:]
+    np.testing.assert_allclose(slopes, in_cam[:, :2] / in_cam[:, 2:], atol=1e-12)
+    theirs = colmap_camera(camera).cam_from_img(pixels)
+    np.testing.assert_allclose(slopes, theirs, atol=4e-10)  # COLMAP stops at 1e-10 of a slope
 
 
-@_CAMERAS
+@_WITH_K3
 def test_the_same_pixel_as_opencv(camera: Camera) -> None:
-    cam_from_world = _WORLD_FROM_CAM.inverse()
+    cam_from_world, points = _WORLD_FROM_CAM.inverse(), points_in_world()
     rvec, _ = cv2.Rodrigues(cam_from_world.rotation)
-    coefficients = np.array(camera.distortion or (0.0,) * 4)
-    pixels, _ = cv2.projectPoints(points_in_world(), rvec, cam_from_world.translation, camera.matrix, coefficients)
-    ours = project(camera, cam_from_world.apply(points_in_world()))
+    coefficients, shift = np.array(camera.distortion or (0.0,) * 4), cam_from_world.translation
+    if camera.model == "fisheye":
+        pixels, _ = cv2.fisheye.projectPoints(points[:, None], rvec, shift, camera.matrix, coefficients)
+    else:
+        pixels, _ = cv2.projectPoints(points, rvec, shift, camera.matrix, coefficients)
+    ours = project(camera, cam_from_world.apply(points))
     np.testing.assert_allclose(ours, np.asarray(pixels).reshape(-1, 2), atol=1e-9)
     np.testing.assert_allclose(rvec.ravel(), log_so3(cam_from_world.rotation), atol=1e-12)
 
@@ -83,16 +86,21 @@ def test_the_same_pixel_as_gtsam(camera: Camera) -> None:
     np.testing.assert_allclose(ours, pixels, atol=1e-9)
 
 
-def test_the_same_derivatives_as_gtsam() -> None:
-    views, points = Views.of([_WORLD_FROM_CAM], [_PINHOLE]), points_in_world()[:5]
+@_CAMERAS
+def test_the_same_derivatives_as_gtsam(camera: Camera) -> None:
+    views, points = Views.of([_WORLD_FROM_CAM], [camera]), points_in_world()[:5]
     lin = linearize(views, np.zeros(5, np.int64), points)
-    theirs = gtsam_camera(_PINHOLE, _WORLD_FROM_CAM)
+    theirs = gtsam_camera(camera, _WORLD_FROM_CAM)
     for k, point in enumerate(points):
         by_pose, by_point = np.zeros((2, 6), order="F"), np.zeros((2, 3), order="F")
-        by_calibration = np.zeros((2, 5), order="F")
+        by_calibration = np.zeros((2, 5 if camera.model == "pinhole" else 9), order="F")
         theirs.project(point, by_pose, by_point, by_calibration)
-        np.testing.assert_allclose(lin.by_pose[k], by_pose, rtol=1e-10, atol=1e-8)
-        np.testing.assert_allclose(lin.by_point[k], by_point, rtol=1e-10, atol=1e-8)
+        np.testing.assert_allclose(lin.by_pose[k], by_pose, rtol=1e-9, atol=1e-8)
+        np.testing.assert_allclose(lin.by_point[k], by_point, rtol=1e-9, atol=1e-8)
+        if camera.model != "pinhole":
+            in_cam = _WORLD_FROM_CAM.inverse().apply(point[None])
+            ours = intrinsic_derivatives(camera, in_cam, ("k1", "k2"))[0]
+            np.testing.assert_allclose(ours, by_calibration[:, 5:7], rtol=1e-9, atol=1e-8)
 
 
 # --- rotations and transforms ---------------------------------------------------------------------

@@ -118,7 +118,7 @@ CASES: dict[str, tuple[Break, list[str]]] = {
     ),
     "two cameras": (
         change("camera.csv", r"\Z", "cam2,640,480,560,560,322,238\n"),
-        ["has 2 cameras: cam, cam2", "epoch of their own", "camera.csv"],
+        ["which of 2 cameras took image 'r0.jpg': cam, cam2", "Add the column to *reference_eo.csv", "In *camera.csv"],
     ),
     "focal length in millimetres": (
         change("camera.csv", "560.0,560.0", "24.0,24.0"),

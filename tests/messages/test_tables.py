@@ -205,11 +205,47 @@ CASES: dict[str, tuple[Callable, str, list[str], int | None]] = {
         ["Image 'a.jpg' has some of sigma_e, sigma_n, sigma_h", "empty them all"],
         2,
     ),
-    "k3": (
+    "k4 of a brown camera": (
         read_cameras,
-        CAMERA_HEADER.strip() + ",k1,k2,p1,p2,k3\ncam,3000,2000,2800,2800,1500,1000,0,0,0,0,0.01\n",
-        ["Column 'k3' has 0.01", "brown model with k1, k2, p1, p2", "k3 fixed at 0"],
+        CAMERA_HEADER.strip() + ",k1,k2,p1,p2,k4\ncam,3000,2000,2800,2800,1500,1000,-0.1,0,0,0,0.01\n",
+        ["Column 'k4' has 0.01", "'brown' does not have", "brown: k1, k2, p1, p2, k3", "k4 fixed at 0"],
         2,
+    ),
+    "p1 of a fisheye": (
+        read_cameras,
+        CAMERA_HEADER.strip() + ",model,k1,p1\ncam,3000,2000,900,900,1500,1000,fisheye,-0.01,0.001\n",
+        ["Column 'p1' has 0.001", "'fisheye' does not have", "fisheye: k1, k2, k3, k4"],
+        2,
+    ),
+    "k1 of a pinhole": (
+        read_cameras,
+        CAMERA_HEADER.strip() + ",model,k1\ncam,3000,2000,2800,2800,1500,1000,pinhole,-0.1\n",
+        ["Column 'k1' has -0.1", "'pinhole' does not have", "name the right model"],
+        2,
+    ),
+    "skewed pixels": (
+        read_cameras,
+        CAMERA_HEADER.strip() + ",skew\ncam,3000,2000,2800,2800,1500,1000,0.5\n",
+        ["Column 'skew' has 0.5", "'pinhole' does not have"],
+        2,
+    ),
+    "a model that is not there": (
+        read_cameras,
+        CAMERA_HEADER.strip() + ",model\ncam,3000,2000,2800,2800,1500,1000,fish-eye\n",
+        ["Column 'model' has 'fish-eye'", "pinhole, brown, fisheye", "Did you mean 'fisheye'"],
+        2,
+    ),
+    "an unknown that cannot be estimated": (
+        read_cameras,
+        CAMERA_HEADER.strip() + ",estimate\ncam,3000,2000,2800,2800,1500,1000,focal cx\n",
+        ["Column 'estimate' has 'focal cx'", '"focal k1"', "leave it empty"],
+        2,
+    ),
+    "no focal length, and not declared unknown": (
+        read_cameras,
+        CAMERA_HEADER.strip() + ",estimate\na,3000,2000,,,,,focal\nb,3000,2000,,2800,1500,1000,\n",
+        ["Column 'fx' is empty"],
+        3,
     ),
     "focal length in millimetres": (
         read_cameras,

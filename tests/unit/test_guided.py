@@ -11,7 +11,8 @@ from georef.estimation.guided import (
     GuidedOptions,
     PosedFeatures,
     epipolar_band,
-    fundamental_matrix,
+    epipolar_distances,
+    essential_matrix,
     guided_matches,
 )
 from georef.geometry.rigid import Rigid3
@@ -29,15 +30,14 @@ def two_photographs(seed: int, *, clutter: int = 0, blunders: float = 0.0, point
     )
 
 
-def test_fundamental_matrix_vanishes_on_exact_pairs() -> None:
+def test_essential_matrix_vanishes_on_exact_pairs() -> None:
     world, rng = court(1), np.random.default_rng(1)
     a, b = (photograph(world, world.references[i], rng, keypoint_sigma=0.0) for i in (0, 3))
     pairs = common(a, b).indices
     posed_a, posed_b = a.posed(), b.posed()
-    x_a = np.column_stack([posed_a.ideal_px[pairs[:, 0]], np.ones(len(pairs))])
-    x_b = np.column_stack([posed_b.ideal_px[pairs[:, 1]], np.ones(len(pairs))])
-    lines = x_a @ fundamental_matrix(posed_a, posed_b).T
-    distance = np.abs(np.sum(x_b * lines, axis=1)) / np.linalg.norm(lines[:, :2], axis=1)
+    rays_a, rays_b = posed_a.bearings.rays[pairs[:, 0]], posed_b.bearings.rays[pairs[:, 1]]
+    assert np.abs(np.einsum("ni,ij,nj->n", rays_b, essential_matrix(posed_a, posed_b), rays_a)).max() < 1e-5
+    distance = epipolar_distances(posed_a, posed_b, pairs)
     assert len(pairs) > 50
     assert distance.max() < 1e-3  # float32 keypoints
 

@@ -124,6 +124,32 @@ def test_camera_models(tmp_path: Path) -> None:
     assert partial["c"].distortion == (-0.1, 0.0, 0.0, 0.0)
 
 
+def test_named_camera_models(tmp_path: Path) -> None:
+    header = "camera,model,width,height,fx,fy,cx,cy,k1,k2,k3,k4,p1,p2\n"
+    rows = (
+        "pin,pinhole,80,60,70,71,41,31,,,,,,\n"
+        "brown,Brown,80,60,70,71,41,31,-0.1,0.01,0.002,,1e-3,2e-3\n"
+        "fish,fisheye,80,60,30,30,41,31,-0.01,1e-3,1e-4,1e-5,,\n"
+        "ideal,fisheye,80,60,30,30,41,31,,,,,,\n"
+    )
+    cameras = read_cameras(written(tmp_path, header + rows))
+    assert [c.model for c in cameras.values()] == ["pinhole", "brown", "fisheye", "fisheye"]
+    assert cameras["pin"].distortion == ()
+    assert cameras["brown"].distortion == (-0.1, 0.01, 1e-3, 2e-3, 0.002)
+    assert cameras["fish"].distortion == (-0.01, 1e-3, 1e-4, 1e-5)
+    assert cameras["ideal"] == Camera("ideal", 80, 60, 30.0, 30.0, 41.0, 31.0, (0.0,) * 4, "fisheye")
+
+
+def test_cameras_that_are_not_known(tmp_path: Path) -> None:
+    rows = "a,80,60,,,,,focal\nb,80,60,90,91,41,31,focal+k1\nc,80,60,70,71,41,31,\n"
+    cameras = read_cameras(written(tmp_path, "camera,width,height,fx,fy,cx,cy,estimate\n" + rows))
+    assert cameras["a"] == Camera("a", 80, 60, 96.0, 96.0, 40.0, 30.0, estimate=("focal",))
+    assert cameras["b"] == Camera("b", 80, 60, 90.0, 91.0, 41.0, 31.0, (0.0,) * 4, "brown", ("focal", "k1"))
+    assert cameras["c"].estimate == ()
+    only = read_cameras(written(tmp_path, "camera,width,height,estimate\na,60,80,focal\n"))
+    assert (only["a"].fx, only["a"].cx, only["a"].cy) == (96.0, 30.0, 40.0)
+
+
 def test_castle(data: Path) -> None:
     castle = data / "castle"
     reference = read_exterior_orientation(

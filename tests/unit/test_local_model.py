@@ -80,7 +80,7 @@ def test_observations_are_of_the_matched_keypoints() -> None:
     for index, reference in enumerate(references):
         here = obs.view == index
         np.testing.assert_array_equal(reference.point[obs.keypoint[here]], query.point[model.keypoint[obs.point[here]]])
-        np.testing.assert_allclose(obs.pixel[here], reference.posed().ideal_px[obs.keypoint[here]])
+        np.testing.assert_allclose(obs.pixel[here], reference.posed().pixels[obs.keypoint[here]])
         scales = reference.features.scales_px[obs.keypoint[here]]
         np.testing.assert_allclose(obs.sigma_px[here], _SIGMA * scales)
 

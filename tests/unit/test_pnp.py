@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
+from georef.estimation.first_pose import QueryImage, ransac_pose
 from georef.estimation.local_model import LocalModel, query_centred_model
-from georef.estimation.pnp import EstimatedPose, QueryImage, ransac_pose, refine_pose, with_covariance
+from georef.estimation.pnp import EstimatedPose, refine_pose, with_covariance
 from georef.geometry.rigid import Array, Rigid3
 from georef.types.results import ReferenceNoise
 from tests.worlds.points import (
@@ -29,7 +30,7 @@ _RUNS = 200
 
 
 def query_image(seen: Seen, sigma: float = NOISE.keypoint_sigma) -> QueryImage:
-    return QueryImage(CAMERA, seen.posed().ideal_px, sigma * seen.features.scales_px.astype(float))
+    return QueryImage(CAMERA, seen.posed().pixels, sigma * seen.features.scales_px.astype(float))
 
 
 def nearby(pose: Rigid3, rng: np.random.Generator) -> Rigid3:
@@ -123,7 +124,7 @@ def test_blunders_are_gated_and_healthy_points_kept() -> None:
 def test_sigma0_shows_understated_keypoint_noise_and_the_covariance_follows() -> None:
     world, rng = court(5), np.random.default_rng(15)
     run = Run(world, rng, scaled_noise(NOISE, poses=1e-6))
-    stated = QueryImage(CAMERA, run.query.ideal_px, run.query.sigma_px / 2.0)
+    stated = QueryImage(CAMERA, run.query.pixels, run.query.sigma_px / 2.0)
     model = LocalModel(
         run.model.keypoint, run.model.points, run.model.cov / 4.0, run.model.views, run.model.observations
     )
@@ -139,7 +140,7 @@ def test_ransac_finds_the_pose_among_many_blunders_also_far_from_the_origin(orig
     run = Run(world, rng, blunders=0.5)
     found = ransac_pose(run.query, run.model, gate_px=12.0, seed=0)
     assert found is not None
-    pose, inliers = found
+    pose, inliers = found.world_from_cam, found.inliers
     error = run.truth.local(pose)
     assert np.linalg.norm(error[:3]) < 0.005
     assert np.linalg.norm(error[3:]) < 0.1

@@ -51,7 +51,7 @@ def test_a_track_is_one_point_with_all_its_observations() -> None:
     np.testing.assert_array_equal(np.bincount(obs.point), [in_images[next(iter(t))] for t in truth])
     for view, image in enumerate(posed):
         here = obs.view == view
-        np.testing.assert_array_equal(obs.pixel[here], image.ideal_px[obs.keypoint[here]])
+        np.testing.assert_array_equal(obs.pixel[here], image.pixels[obs.keypoint[here]])
         ratio = obs.sigma_px[here] / (_SIGMA * image.features.scales_px[obs.keypoint[here]])
         assert np.abs(np.log2(ratio)).max() <= 0.125 + 1e-6
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from georef.geometry.camera import Camera, ideal_from_observed
+from georef.geometry.camera import Camera
 from georef.geometry.covariance import pose_cov_from_parts
 from georef.geometry.projection import Views
 from georef.geometry.rigid import Array, Rigid3
@@ -141,7 +141,7 @@ def control_observations(problem: Problem) -> Observations:
     """
     index = {name: i for i, name in enumerate(problem.image_ids)}
     rows = [
-        (p, index[mark.image_id], ideal_from_observed(problem.cameras[index[mark.image_id]], mark.pixel), mark.sigma_px)
+        (p, index[mark.image_id], mark.pixel, mark.sigma_px)
         for p, point in enumerate(problem.control)
         for mark in point.marks
         if mark.image_id in index

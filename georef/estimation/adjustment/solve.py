@@ -4,15 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from functools import partial
 
 import gtsam
 import numpy as np
 
 from georef.estimation.adjustment.problem import Problem, control_observations
+from georef.estimation.adjustment.projection_factors import add_observations
 from georef.geometry.projection import Views
 from georef.geometry.rigid import Array, Rigid3
 from georef.geometry.triangulation import triangulate
-from georef.types.scene import Observations
 
 _STEP_TOLERANCE = 1e-7
 _LAMBDA_INITIAL = 1e-6
@@ -36,8 +37,9 @@ def solve(problem: Problem, *, cauchy_scale: float | None, max_iterations: int) 
     """
     images, points = len(problem.image_ids), len(problem.points)
     graph = gtsam.NonlinearFactorGraph()
-    _add_observations(graph, problem, problem.observations, images, cauchy_scale)
-    _add_observations(graph, problem, control_observations(problem), images + points, cauchy_scale)
+    robust = partial(_robust, cauchy_scale=cauchy_scale)
+    add_observations(graph, problem.cameras, problem.observations, images, robust)
+    add_observations(graph, problem.cameras, control_observations(problem), images + points, robust)
     _add_pose_priors(graph, problem, cauchy_scale)
     gcps = problem.gcps
     _add_point_priors(graph, images + gcps.point, gcps.position, gcps.cov, cauchy_scale)
@@ -46,23 +48,6 @@ def solve(problem: Problem, *, cauchy_scale: float | None, max_iterations: int) 
     _add_point_priors(graph, keys, [c.point_in_world for c in control], [c.cov for c in control], cauchy_scale)
     values = _initial_values(problem, images, points)
     return _optimize(graph, values, problem, max_iterations)
-
-
-def _add_observations(
-    graph: gtsam.NonlinearFactorGraph, problem: Problem, obs: Observations, first_key: int, cauchy_scale: float | None
-) -> None:
-    """Bulk insertion by image and noise level."""
-    order = np.lexsort((obs.sigma_px, obs.view))
-    view, sigma = obs.view[order], obs.sigma_px[order]
-    starts = np.flatnonzero(np.concatenate([[True], (np.diff(view) != 0) | (np.diff(sigma) != 0)])) if len(view) else []
-    for chunk in np.split(order, starts[1:]) if len(view) else []:
-        camera = problem.cameras[obs.view[chunk[0]]]
-        calibration = gtsam.Cal3_S2(camera.fx, camera.fy, 0.0, camera.cx, camera.cy)
-        model = _robust(gtsam.noiseModel.Isotropic.Sigma(2, float(obs.sigma_px[chunk[0]])), cauchy_scale)
-        keys = (first_key + obs.point[chunk]).astype(np.float64)
-        gtsam.utilities.insertProjectionFactors(
-            graph, int(obs.view[chunk[0]]), keys, np.asfortranarray(obs.pixel[chunk].T), model, calibration
-        )
 
 
 def _add_pose_priors(graph: gtsam.NonlinearFactorGraph, problem: Problem, cauchy_scale: float | None) -> None:
