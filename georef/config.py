@@ -6,9 +6,9 @@ import difflib
 import tomllib
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any, Literal, TypeVar
+from typing import Annotated, Any, Literal, TypeVar
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, field_validator
 
 from georef.errors import ConfigError
 
@@ -19,10 +19,26 @@ class Section(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
 
+def _zero_or(least: int) -> AfterValidator:
+    """Checks a number that is 0, for what is said beside it, or at least `least`."""
+
+    def check(value: int) -> int:
+        if value != 0 and value < least:
+            raise ValueError(f"expected 0, or {least} or more")
+        return value
+
+    return AfterValidator(check)
+
+
+ZeroOr16 = Annotated[int, _zero_or(16)]
+ZeroOr64 = Annotated[int, _zero_or(64)]
+
+
 class FeaturesConfig(Section):
     extractor: str = "aliked-n16"
-    longest_side_px: int = Field(default=1024, ge=64)
-    max_keypoints: int = Field(default=4096, ge=16)
+    longest_side_px: ZeroOr64 = 1024
+    max_keypoints: ZeroOr16 = 0
+    device: Literal["auto", "cpu", "cuda"] = "auto"
 
 
 class MatchingConfig(Section):

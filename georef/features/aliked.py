@@ -6,14 +6,14 @@ import numpy as np
 import torch
 
 from georef.features.aliked_network import AlikedNetwork
-from georef.features.aliked_peaks import find_peaks
 from georef.features.base import Detections, Image
 from georef.features.device import choose_device
+from georef.features.peaks import find_peaks
 from georef.features.weights import load_state_dict, version_tag
 
 
-class AlikedN16:
-    """ALIKED with 16 sampling positions a descriptor; descriptors (N, 128) float16 of unit length.
+class Aliked:
+    """ALIKED; descriptors (N, 128) float16 of unit length, from 16 sampling positions each (aliked-n32: 32).
 
     detection_threshold: score in (0, 1) that a keypoint must exceed; images without structure stay below 0.02.
     device: "cpu", "cuda", or "auto". Raises WeightsError where the weights are not in the cache.
@@ -24,9 +24,11 @@ class AlikedN16:
     but its own, use SIFT.
     """
 
-    name = "aliked-n16"
+    name: str  # of the weights too
     descriptor_size = 128
     descriptor_dtype = np.dtype(np.float16)
+    largest_side_px = 2048
+    tile_side_px = 1024
 
     def __init__(self, *, detection_threshold: float = 0.05, device: str = "cpu") -> None:
         self._threshold = detection_threshold
@@ -51,3 +53,21 @@ class AlikedN16:
             scales_px=np.ones(len(scores), np.float32),
             descriptors=descriptors.half().cpu().numpy(),
         )
+
+
+class AlikedN16(Aliked):
+    """The usual one."""
+
+    name = "aliked-n16"
+
+
+class AlikedN16Rot(Aliked):
+    """Trained on turned images too: of the three the one for cameras that are held either way."""
+
+    name = "aliked-n16rot"
+
+
+class AlikedN32(Aliked):
+    """Twice the sampling positions: a little slower, a little better in the authors' tables."""
+
+    name = "aliked-n32"

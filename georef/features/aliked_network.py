@@ -15,6 +15,8 @@ import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, conv2d, embedding_bag, interpolate, linear, normalize, pad, selu
 
+from georef.features.corners import corners
+
 PATCH = 3  # pixels of the window that a descriptor's sampling positions are computed from
 _MULTIPLE = 32  # sides that the four levels divide
 _STRIP = 65536  # pixels whose 32 channels of full resolution exist at once: 8 MB
@@ -83,7 +85,7 @@ class AlikedNetwork:
         y, x0 = torch.meshgrid(_range(rows, x), _range(columns, x), indexing="ij")
         tap = _range(9, x)[:, None, None]
         at = torch.stack([x0 + tap % 3 - 1 + shifts[:, 1], y + tap // 3 - 1 + shifts[:, 0]], -1)  # (9, H, W, 2)
-        index, share = _corners(at.permute(1, 2, 0, 3).reshape(-1, 2), (columns, rows))
+        index, share = corners(at.permute(1, 2, 0, 3).reshape(-1, 2), (columns, rows))
         taken = embedding_bag(index, _rows(x), per_sample_weights=share, mode="sum").view(rows * columns, -1)
         weight = self._weights[f"{name}.regular_conv.weight"]  # (out, in, 3, 3)
         out = linear(taken, weight.flatten(2).transpose(1, 2).flatten(1), self._weights[f"{name}.regular_conv.bias"])
@@ -112,7 +114,7 @@ class AlikedNetwork:
         window = corner[:, None] + torch.stack([step % PATCH, step // PATCH], -1)
         patches = self._features_at(levels, window.reshape(-1, 2)).view(count, PATCH * PATCH, -1)
         shifts = self._sampling_shifts(patches).clamp(-limit, limit)
-        index, share = _corners((keypoints[:, None] + shifts).reshape(-1, 2), levels.image_size)
+        index, share = corners((keypoints[:, None] + shifts).reshape(-1, 2), levels.image_size)
         pixels = torch.stack([index % size[0], index // size[0]], -1).reshape(-1, 2)
         around = self._features_at(levels, pixels).view(*index.shape, -1)
         taken = (share[:, None] @ around)[:, 0]
@@ -144,7 +146,7 @@ class AlikedNetwork:
         full = torch.tensor([columns - 1, rows - 1], device=pixels.device)
         for table, grid in zip(levels.tables[1:], levels.grids[1:], strict=True):
             last = torch.tensor([grid[1] - 1, grid[0] - 1], device=pixels.device)
-            index, share = _corners(place * (last / full), (grid[1], grid[0]))
+            index, share = corners(place * (last / full), (grid[1], grid[0]))
             parts.append(embedding_bag(index, table, per_sample_weights=share, mode="sum"))
         return normalize(torch.cat(parts, 1))
 
@@ -167,10 +169,8 @@ def _padded(image: Tensor) -> tuple[Tensor, tuple[int, int]]:
     missing = [-side % _MULTIPLE for side in (image.shape[3], image.shape[2])]
     x, y = (side // 2 for side in missing)
     padded = pad(image, (x, missing[0] - x, y, missing[1] - y), mode="replicate")
-    return padded.contiguous(memory_format=torch.channels_last), (
-        x,
-        y,
-    )  # that order halves the time of all that follows
+    # that order halves the time of all that follows
+    return padded.contiguous(memory_format=torch.channels_last), (x, y)
 
 
 def _rows(x: Tensor) -> Tensor:
@@ -180,22 +180,3 @@ def _rows(x: Tensor) -> Tensor:
 
 def _range(count: int, like: Tensor) -> Tensor:
     return torch.arange(count, device=like.device, dtype=torch.float32)
-
-
-def _corners(at: Tensor, size: tuple[int, int]) -> tuple[Tensor, Tensor]:
-    """Row-major indices (P, 4) of the four pixels around places (P, 2), and their shares (P, 4) in bilinear
-    interpolation; what lies outside the map of `size` (width, height) has no share."""
-    width, height = size
-    low = at.floor()
-    high_share = at - low
-    x, y = low.long().unbind(1)
-    index, share = [], []
-    for dy in (0, 1):
-        for dx in (0, 1):
-            column, row = x + dx, y + dy
-            inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
-            part_x = high_share[:, 0] if dx else 1 - high_share[:, 0]
-            part_y = high_share[:, 1] if dy else 1 - high_share[:, 1]
-            index.append((row * width + column).where(inside, 0))
-            share.append((part_x * part_y).where(inside, 0))
-    return torch.stack(index, 1), torch.stack(share, 1)

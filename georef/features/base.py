@@ -2,30 +2,21 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Protocol
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from georef.features.detections import Descriptors, Detections, Image
+from georef.features.tiling import detect_in_tiles
 from georef.geometry.pixels import level_size, resize_keypoints
 from georef.types.features import Features, Matches
 
-Image = NDArray[np.uint8]  # (H, W, 3), RGB
-Descriptors = NDArray[np.float32] | NDArray[np.float16] | NDArray[np.uint8]  # (N, D)
+__all__ = ["Descriptors", "Detections", "Extractor", "Image", "Matcher", "extract_features"]
 
 SMALLEST_SIDE_PX = 16  # below this a level holds nothing that a detector could localise
-
-
-@dataclass(frozen=True, eq=False)
-class Detections:
-    """What an extractor found in one level, in any order, in pixels of that level; (0.5, 0.5) is the first centre."""
-
-    keypoints_px: NDArray[np.float32]  # (N, 2)
-    scores: NDArray[np.float32]  # (N,)
-    scales_px: NDArray[np.float32]  # (N,) size of what was localised: its noise scales with it
-    descriptors: Descriptors  # (N, D)
+_BUDGETS = ((1024, 4096), (2048, 6144))  # keypoints of levels whose longest side is at most so many pixels
+_BUDGET_PER_MEGAPIXEL = 1024  # of larger levels
 
 
 class Extractor(Protocol):
@@ -39,6 +30,16 @@ class Extractor(Protocol):
 
     @property
     def descriptor_dtype(self) -> np.dtype: ...
+
+    @property
+    def largest_side_px(self) -> int | None:
+        """Longest side of a level that is looked at as a whole; larger ones in tiles. None: any."""
+        ...
+
+    @property
+    def tile_side_px(self) -> int:
+        """Side of those tiles."""
+        ...
 
     def version(self) -> str:
         """What decides the result beside the input: library versions, weights hash, fixed settings."""
@@ -64,19 +65,38 @@ class Matcher(Protocol):
         ...
 
 
-def extract_features(extractor: Extractor, image_rgb: Image, longest_side: int, max_keypoints: int) -> Features:
+def extract_features(
+    extractor: Extractor, image_rgb: Image, longest_side: int | None, max_keypoints: int | None
+) -> Features:
     """Features of an image (H, W, 3) uint8 RGB, found in a level whose longest side is at most `longest_side` pixels.
 
+    longest_side: None for the full resolution. max_keypoints: None for the budget of the level.
     Keypoints and scales come back in pixels of the full-resolution image, sorted by falling score. An image without
     structure, or with a level smaller than `SMALLEST_SIDE_PX`, gives empty features of the right shapes.
     """
     _check_image(image_rgb)
     image_size = (image_rgb.shape[1], image_rgb.shape[0])
-    level = resize_image(image_rgb, level_size(image_size, longest_side))
-    if min(level.shape[:2]) < SMALLEST_SIDE_PX or max_keypoints <= 0:
+    size = level_size(image_size, max(image_size) if longest_side is None else longest_side)
+    budget = level_budget(size) if max_keypoints is None else max_keypoints
+    if min(size) < SMALLEST_SIDE_PX or budget <= 0:
         return empty_features(extractor, image_size)
-    found = extractor.detect(level, max_keypoints)
-    return _to_full_resolution(found, level, image_size).head(max_keypoints)
+    level = resize_image(image_rgb, size)
+    return _to_full_resolution(_detect(extractor, level, budget), level, image_size).head(budget)
+
+
+def level_budget(size: tuple[int, int]) -> int:
+    """Keypoints that a level (width, height) is worth: 4,096 up to 1024 px, 6,144 up to 2048 px, then 1,024 a megapixel
+    and no fewer than 6,144."""
+    for side, budget in _BUDGETS:
+        if max(size) <= side:
+            return budget
+    return max(_BUDGETS[-1][1], round(size[0] * size[1] * 1e-6 * _BUDGET_PER_MEGAPIXEL))
+
+
+def _detect(extractor: Extractor, level: Image, max_keypoints: int) -> Detections:
+    if extractor.largest_side_px is None or max(level.shape[:2]) <= extractor.largest_side_px:
+        return extractor.detect(level, max_keypoints)
+    return detect_in_tiles(extractor.detect, level, extractor.tile_side_px, max_keypoints)
 
 
 def empty_features(extractor: Extractor, image_size: tuple[int, int]) -> Features:

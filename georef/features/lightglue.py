@@ -17,8 +17,8 @@ from georef.types.features import Features, Matches
 Precision = Literal["auto", "float32", "bfloat16"]
 
 
-class LightGlueAliked:
-    """LightGlue for the descriptors of aliked-n16: all nine layers for all keypoints, no early stop, no pruning.
+class LightGlue:
+    """LightGlue for the descriptors of one extractor: all layers for all keypoints, no early stop, no pruning.
 
     max_keypoints: only that many best keypoints of each image are matched; the cost grows with the square.
     min_score: matches that do not exceed it are dropped. precision: "bfloat16" takes a third of the time where the
@@ -27,9 +27,9 @@ class LightGlueAliked:
     Raises ConfigError for an unknown precision, WeightsError where the weights are not in the cache.
     """
 
-    name = "lightglue-aliked"
-    extractors = ("aliked-n16",)  # whose descriptors the weights are made for
-    weights = "aliked_lightglue"
+    name: str
+    extractors: tuple[str, ...]  # whose descriptors the weights are made for
+    weights: str
 
     def __init__(
         self,
@@ -55,7 +55,7 @@ class LightGlueAliked:
         return f"{self.name}-1 torch={torch.__version__} weights={weights} {settings}"
 
     def match(self, a: Features, b: Features) -> Matches:
-        """Matches of features with 128-d descriptors; scores are the network's, in (0, 1]."""
+        """Matches of features of one of `extractors`; scores are the network's, in (0, 1]."""
         if self._max_keypoints is not None:
             a, b = a.head(self._max_keypoints), b.head(self._max_keypoints)
         if len(a) == 0 or len(b) == 0:
@@ -71,6 +71,40 @@ class LightGlueAliked:
             torch.from_numpy(places).to(self._device),
             torch.from_numpy(features.descriptors.astype(np.float32)).to(self._device),
         )
+
+
+class LightGlueAliked(LightGlue):
+    name = "lightglue-aliked"
+    extractors = ("aliked-n16",)
+    weights = "aliked_lightglue"
+
+
+class LightGlueDisk(LightGlue):
+    name = "lightglue-disk"
+    extractors = ("disk",)
+    weights = "disk_lightglue"
+
+
+class LightGlueSuperPoint(LightGlue):
+    """The matcher's weights are free; those of SuperPoint are not."""
+
+    name = "lightglue-superpoint"
+    extractors = ("superpoint",)
+    weights = "superpoint_lightglue"
+
+
+class LighterGlue(LightGlue):
+    """A sixth of LightGlue in width and depth, trained with XFeat (Potje et al. 2024)."""
+
+    name = "lighterglue-xfeat"
+    extractors = ("xfeat",)
+    weights = "xfeat-lighterglue"
+
+
+class LightGlueRdd(LightGlue):
+    name = "lightglue-rdd"
+    extractors = ("rdd",)
+    weights = "rdd_lightglue-v2"
 
 
 def _best_precision(device: torch.device) -> Precision:

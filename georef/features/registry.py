@@ -48,6 +48,10 @@ EXTRACTORS = ComponentTable(
     {
         "sift": "georef.features.sift:Sift",
         "aliked-n16": "georef.features.aliked:AlikedN16",
+        "aliked-n16rot": "georef.features.aliked:AlikedN16Rot",
+        "aliked-n32": "georef.features.aliked:AlikedN32",
+        "disk": "georef.features.disk:Disk",
+        "xfeat": "georef.features.xfeat:XFeat",
     },
 )
 
@@ -57,6 +61,8 @@ MATCHERS = ComponentTable(
     {
         "mutual-nn": "georef.features.nearest:MutualNearest",
         "lightglue-aliked": "georef.features.lightglue:LightGlueAliked",
+        "lightglue-disk": "georef.features.lightglue:LightGlueDisk",
+        "lighterglue-xfeat": "georef.features.lightglue:LighterGlue",
     },
 )
 
@@ -79,8 +85,10 @@ GLOBAL_DESCRIPTORS = ComponentTable(
 )
 
 
-def load_component(table: ComponentTable, name: str, **options: Any) -> Any:
+def load_component(table: ComponentTable, name: str, *, device: str | None = None, **options: Any) -> Any:
     """Make the component of that name: `load_component(EXTRACTORS, "sift")`; options go to its constructor.
+
+    device: "cpu", "cuda" or "auto", for components that have a choice; the others do without.
 
     Raises ConfigError for an unknown name or option, or a component whose module cannot be imported; what the
     constructor raises (WeightsError, for one) passes through.
@@ -90,6 +98,8 @@ def load_component(table: ComponentTable, name: str, **options: Any) -> Any:
         make = getattr(import_module(point.module), point.attr)
     except (ImportError, AttributeError) as error:
         raise ConfigError(f"The {table.kind} '{name}' cannot be loaded from {point.value}: {error}") from error
+    if device is not None and "device" in inspect.signature(make).parameters:
+        options["device"] = device
     try:
         inspect.signature(make).bind(**options)
     except TypeError as error:

@@ -19,6 +19,8 @@ class Sift:
     name = "sift"
     descriptor_size = 128
     descriptor_dtype = np.dtype(np.uint8)
+    largest_side_px = None
+    tile_side_px = 4096
 
     def __init__(self, *, contrast_threshold: float = 0.0133, edge_threshold: float = 10.0) -> None:
         self._contrast_threshold = contrast_threshold

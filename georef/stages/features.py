@@ -28,7 +28,7 @@ class ExtractTask:
 
     @cached_property
     def extractor(self) -> Extractor:
-        return load_component(EXTRACTORS, self.config.extractor)
+        return _load_extractor(self.config)
 
     def __call__(self, image: Image) -> tuple[str, str] | None:
         try:
@@ -39,7 +39,8 @@ class ExtractTask:
         if size != (camera.width, camera.height):
             problem = f"the image has {size[0]} x {size[1]} px, its camera {camera.width} x {camera.height}"
             return RejectReason.WRONG_SIZE.value, problem
-        features = extract_features(self.extractor, pixels, self.config.longest_side_px, self.config.max_keypoints)
+        level, budget = self.config.longest_side_px or None, self.config.max_keypoints or None
+        features = extract_features(self.extractor, pixels, level, budget)
         FeatureStore(self.folder, extractor_version=self.version).write(feature_id(image), features, image.path)
         return None
 
@@ -66,8 +67,13 @@ def run(context: StageContext) -> StageSummary:
 
 def extractor_version(config: FeaturesConfig) -> str:
     """What decides the features beside the image: the component, its weights and settings, level and budget."""
-    version = load_component(EXTRACTORS, config.extractor).version()
-    return f"{version}; longest side {config.longest_side_px}; at most {config.max_keypoints}"
+    level = f"longest side {config.longest_side_px or 'full'}"
+    budget = f"at most {config.max_keypoints or 'the budget of the level'}"
+    return f"{_load_extractor(config).version()}; {level}; {budget}"
+
+
+def _load_extractor(config: FeaturesConfig) -> Extractor:
+    return load_component(EXTRACTORS, config.extractor, device=config.device)
 
 
 def failed_images(folder: Path) -> dict[str, tuple[str, str]]:
