@@ -125,9 +125,10 @@ def check_repeatable(samples: Iterable[Any]) -> None:
 
 
 def _resized(image_rgb: Image, height: int, width: int) -> torch.Tensor:
+    """Bilinear with the triangle as wide as the reduction, and rounded to bytes, as the networks were trained."""
     import torch
 
-    pixels = torch.from_numpy(np.ascontiguousarray(check_image(image_rgb))).permute(2, 0, 1)[None].float()
+    pixels = torch.from_numpy(np.array(check_image(image_rgb), order="C")).permute(2, 0, 1)[None]
     if pixels.shape[2:] != (height, width):
         pixels = torch.nn.functional.interpolate(pixels, (height, width), mode="bilinear", antialias=True)
-    return pixels[0].div_(255).clamp_(0, 1)
+    return pixels[0].float().div_(255)
