@@ -31,14 +31,17 @@ class Box:
 def search_box(positions: Array, prior: PositionPrior | None, config: CandidatesConfig) -> Box:
     """References (of positions (N, 3)) inside a square box about a position prior; widened until there are enough.
 
-    `published` takes the stated uncertainty as half the side; `reach` max(min_half_side, 3 sigma + viewing reach).
+    `published` takes the stated uncertainty as half the side; `reach` max(min_half_side, 3 sigma + viewing reach);
+    `fixed` half_side_m; `none` has no box.
     """
+    if config.box == "none":
+        return Box(np.arange(len(positions)), True)
     if prior is None:
         return Box(np.arange(len(positions)), True, "no position prior: searched the whole reference")
     offset = np.abs(positions[:, :2] - prior.position_in_world[:2]).max(axis=1)
     sigma = float(np.sqrt(np.linalg.eigvalsh(prior.cov[:2, :2])[-1]))
     reach = max(config.min_half_side_m, 3.0 * sigma + config.viewing_reach_m)
-    asked = sigma if config.box == "published" else reach
+    asked = {"published": sigma, "fixed": config.half_side_m}.get(config.box, reach)
     half_side, needed = asked, min(config.count, int(np.isfinite(offset).sum()))
     while np.count_nonzero(offset <= half_side) < needed:
         half_side *= 2.0

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -13,11 +12,13 @@ from scipy.stats import chi2
 
 from georef.config import CandidatesConfig, LocalizeConfig
 from georef.estimation.candidates import Box, in_heading_window, overlap, search_box, vote
+from georef.estimation.global_model import global_model, one_point_each
 from georef.estimation.guided import GuidedOptions, PosedFeatures, guided_matches
 from georef.estimation.local_model import LocalModel, query_centred_model
 from georef.estimation.pnp import EstimatedPose, QueryImage, ransac_pose, refine_pose, refit_pose, with_covariance
 from georef.estimation.published import VerifyPair, published_model, verify_pair
 from georef.estimation.reference_map import ReferenceMap
+from georef.estimation.timer import StepTimer
 from georef.features.base import Matcher
 from georef.geometry.covariance import position_cov_in_world
 from georef.geometry.rigid import Rigid3
@@ -45,14 +46,15 @@ class _Work:
     cpu_s: dict[str, float] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
     pairs: dict[int, Matches] = field(default_factory=dict)
+    tried: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         self.posed = PosedFeatures.of(self.features, self.image.camera, Rigid3.identity())
         sigma = self.reference.noise.keypoint_sigma * self.features.scales_px.astype(np.float64)
         self.query = QueryImage(self.image.camera, self.posed.ideal_px, sigma)
 
-    def timed(self, step: str) -> _Timer:
-        return _Timer(self.cpu_s, step)
+    def timed(self, step: str) -> StepTimer:
+        return StepTimer(self.cpu_s, step)
 
 
 def localize_image(
@@ -78,7 +80,8 @@ def localize_image(
             f"inside the search box: {outcome.reason.value} ({outcome.detail}); tried the whole reference"
         )
         outcome = _localize_in(work, search_box(reference.positions, None, candidates))
-    return replace(_against_prior(outcome, image, config), notes=tuple(work.notes))
+    judged = _against_prior(outcome, image, config)
+    return replace(judged, notes=tuple(work.notes), cpu_s=dict(work.cpu_s), candidates=work.tried)
 
 
 def _localize_in(work: _Work, box: Box) -> Outcome:
@@ -93,8 +96,8 @@ def _localize_in(work: _Work, box: Box) -> Outcome:
     if len(inside) < len(box.indices[in_window]):
         work.notes.append(f"searched the nearest {len(inside)} of {len(box.indices)} references")
     ranked = _rank_by_votes(work, inside)
-    method = _published if work.config.method == "published" else _query_centred
-    return method(work, ranked)
+    work.tried = tuple(work.reference.images[int(i)].image_id for i in ranked[: work.candidates.count])
+    return _METHODS[work.config.method](work, ranked)
 
 
 def _rank_by_votes(work: _Work, indices: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -175,6 +178,21 @@ def _published(work: _Work, ranked: NDArray[np.int64]) -> Outcome:
     references = [work.reference.posed(i) for i in chosen]
     with work.timed("matching"):
         model = published_model(references, _pair_verifier(work, chosen, references), work.reference.noise)
+    return _posed_by_ransac(work, model, chosen)
+
+
+def _global_model(work: _Work, ranked: NDArray[np.int64]) -> Outcome:
+    """The query matched with its candidates; points of the precomputed map by the keypoints that it matches there."""
+    candidates = sorted(int(i) for i in ranked[: work.candidates.count])
+    matches = {index: _matched(work, index) for index in candidates}
+    with work.timed("map points"):
+        structures = {index: work.reference.structure(index) for index in candidates}
+        model, chosen = global_model(structures, matches, work.reference.views)
+    return _posed_by_ransac(work, model, chosen)
+
+
+def _posed_by_ransac(work: _Work, model: LocalModel, chosen: Sequence[int]) -> Outcome:
+    """RANSAC and COLMAP's refinement on its inliers, one point a keypoint; then the covariance."""
     with work.timed("pose"):
         if len(model) < work.config.min_inliers:
             return Rejected(work.image.image_id, RejectReason.FEW_MATCHES, f"{len(model)} triangulated points")
@@ -183,7 +201,8 @@ def _published(work: _Work, ranked: NDArray[np.int64]) -> Outcome:
         if found is None or not _enough(inliers, len(model), work.config):
             detail = f"{inliers} of {len(model)} points agree with one pose"
             return Rejected(work.image.image_id, RejectReason.FEW_INLIERS, detail)
-        estimate = with_covariance(found[0], work.query, model, found[1], lambda v: work.reference.pose_cov(chosen[v]))
+        used = one_point_each(found[0], work.query, model, found[1])
+        estimate = with_covariance(found[0], work.query, model, used, lambda v: work.reference.pose_cov(chosen[v]))
     return _outcome(work, estimate, model, chosen)
 
 
@@ -265,14 +284,8 @@ def _against_prior(outcome: Outcome, image: Image, config: LocalizeConfig) -> Ou
     return replace(outcome, gnss_rejected=True, gnss_offset_m=distance)
 
 
-class _Timer:
-    """Adds the CPU seconds of a block to a step."""
-
-    def __init__(self, times: dict[str, float], step: str) -> None:
-        self.times, self.step = times, step
-
-    def __enter__(self) -> None:
-        self.start = time.process_time()
-
-    def __exit__(self, *_: object) -> None:
-        self.times[self.step] = self.times.get(self.step, 0.0) + time.process_time() - self.start
+_METHODS: dict[str, Callable[[_Work, NDArray[np.int64]], Outcome]] = {
+    "query-centred": _query_centred,
+    "published": _published,
+    "global-model": _global_model,
+}

@@ -18,13 +18,15 @@ from georef.estimation.reference_map import ReferenceMap
 from georef.features.base import Matcher
 from georef.features.registry import MATCHERS, load_component
 from georef.io.items import item_ids, item_path, read_outcome, write_outcome
+from georef.io.structures import read_structure
 from georef.stages.base import StageContext, StageSummary, feature_id, open_features
 from georef.stages.network import read_noise
 from georef.types.campaign import Campaign, Image
 from georef.types.features import Features
 from georef.types.results import Localized, Outcome, ReferenceNoise, Rejected, RejectReason
+from georef.types.scene import ImageStructure
 
-ITEMS = "items"
+ITEMS, STRUCTURE = "items", "structure"
 logger = logging.getLogger(__name__)
 
 
@@ -37,6 +39,7 @@ class LocalizeTask:
     store_folder: Path
     config: Config
     failed: dict[str, tuple[str, str]]
+    map_folder: Path | None = None  # of the precomputed map, where the method needs one
 
     @cached_property
     def map(self) -> ReferenceMap:
@@ -45,7 +48,13 @@ class LocalizeTask:
         def read(image_id: str, count: int | None) -> Features:
             return store.read(f"{self.reference.epoch}/{image_id}", count)
 
-        return ReferenceMap(self.reference, read, self.noise)
+        folder, places = self.map_folder, {image.image_id: k for k, image in enumerate(self.reference.images)}
+
+        def structure(index: int) -> ImageStructure:
+            assert folder is not None
+            return read_structure(item_path(folder / STRUCTURE, self.reference.images[index].image_id), places)
+
+        return ReferenceMap(self.reference, read, self.noise, None if folder is None else structure)
 
     @cached_property
     def matcher(self) -> Matcher:
@@ -91,7 +100,8 @@ def make_task(context: StageContext) -> LocalizeTask:
     usable = tuple(i for i in reference.images if i.image_id not in suspects and feature_id(i) not in failed)
     if len(usable) < 2:
         raise StageError(f"Only {len(usable)} reference images can be used, at least two are needed.")
-    return LocalizeTask(Campaign(reference.epoch, usable), noise, context.before["store"], context.config, failed)
+    campaign, store = Campaign(reference.epoch, usable), context.before["store"]
+    return LocalizeTask(campaign, noise, store, context.config, failed, context.before.get("global-map"))
 
 
 def outcomes_exist(context: StageContext) -> bool:
@@ -124,8 +134,8 @@ def _summary(outcomes: list[Outcome], computed: int) -> StageSummary:
 
 
 def components(config: Config, stage: str) -> str:
-    """What else than configuration and inputs decides the result: the matcher's version, for this stage alone."""
-    if stage != "localize":
+    """What else than configuration and inputs decides the result: the matcher's version, for stages that match."""
+    if stage not in ("localize", "global-map"):
         return ""
     matcher = load_component(MATCHERS, config.matching.matcher, **config.matching.options)
     fitting = getattr(matcher, "extractors", None)  # None: any

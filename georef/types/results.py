@@ -52,6 +52,7 @@ class Localized:
     gnss_offset_m: float | None = None  # distance from a rejected position prior
     notes: tuple[str, ...] = ()
     cpu_s: dict[str, float] = field(default_factory=dict)
+    candidates: tuple[str, ...] = ()  # references that were tried, the most promising first
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,6 +61,8 @@ class Rejected:
     reason: RejectReason
     detail: str
     notes: tuple[str, ...] = ()
+    cpu_s: dict[str, float] = field(default_factory=dict)
+    candidates: tuple[str, ...] = ()  # references that were tried, the most promising first
 
 
 Outcome = Localized | Rejected
