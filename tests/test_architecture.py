@@ -37,12 +37,16 @@ ALLOWED: dict[str, set[str]] = {
         *("evaluation", "estimation", "capture", "simulate", "report", "viewer"),
     },
     "pipeline": {"errors", "config", "project", "executor", "types", "io", "stages"},
+    "comparison": {
+        *("errors", "config", "project", "executor", "geometry", "types", "crs", "io", "store", "evaluation", "report"),
+        *("stages", "pipeline"),
+    },
     "doctor": {"errors", "config", "project", "features", "stages"},
     "terminal": {"errors"},
     "cli_weights": {"errors", "terminal", "doctor", "features"},
     "cli": {
         *("errors", "terminal", "cli_weights", "doctor", "project", "executor", "progress", "pipeline", "stages"),
-        *("viewer", "capture", "simulate"),
+        *("comparison", "viewer", "capture", "simulate"),
     },
 }
 FOLDER_NAMES = {"work", "epochs", "campaigns"}  # inside a project

@@ -125,9 +125,7 @@ def global_model(
     ), names
 
 
-def one_point_each(
-    pose: Rigid3, query: QueryImage, model: LocalModel, inliers: NDArray[np.bool_]
-) -> NDArray[np.bool_]:
+def one_point_each(pose: Rigid3, query: QueryImage, model: LocalModel, inliers: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Of the inliers (P,) that share a query keypoint, the one that the pose projects nearest to it."""
     views = Views.of([pose], [query.camera])
     off = views.project(np.zeros(len(model), np.int64), model.points) - query.ideal_px[model.keypoint]

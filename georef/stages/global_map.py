@@ -19,7 +19,6 @@ from georef.io.items import item_ids, item_path, read_item, write_item
 from georef.io.structures import read_structure, write_structure
 from georef.stages.base import StageContext, StageSummary
 from georef.stages.localize import STRUCTURE, LocalizeTask, make_task
-from georef.types.features import Matches
 
 MATCHES = "matches"
 
@@ -94,7 +93,7 @@ def run(context: StageContext) -> StageSummary:
     reference, config = localize.map, context.config.global_map
     cameras = [image.camera for image in reference.images]
     pairs = tuple(choose_pairs(Frusta.of(reference.poses, cameras, config.viewing_reach_m), config.neighbours))
-    match, triangulate = (kind(localize, context.folder, pairs) for kind in (MatchTask, TriangulateTask))
+    match, triangulate = MatchTask(localize, context.folder, pairs), TriangulateTask(localize, context.folder, pairs)
     done = item_ids(context.folder / MATCHES)
     pending = [index for index, name in enumerate(match.ids) if name not in done]
     for _ in context.executor.map_items(match, pending, "map matching"):
