@@ -18,7 +18,7 @@ from cyclopts import App, Parameter
 from georef import __version__
 from georef.cli_benchmark import benchmark
 from georef.cli_weights import weights
-from georef.terminal import exit_code, say
+from georef.terminal import exit_code, say, say_table
 
 if TYPE_CHECKING:
     from georef.doctor import Finding
@@ -202,25 +202,50 @@ def view(
 
 @app.command
 def evaluate(
+    project: Annotated[Path | None, Parameter(help="Project folder, or its project.toml; or name --poses.")] = None,
     *,
-    poses: Annotated[Path, Parameter(help="Poses as georef writes them, or a plain exterior orientation.")],
     truth: Annotated[Path, Parameter(help="True exterior orientation of the same images.")],
     truth_sigma: Annotated[
         str | None, Parameter(help="How well the truth is known: POSITION_M,ROTATION_DEG, 1-sigma per axis.")
     ] = None,
+    tables: Annotated[str, Parameter(help="Of a project: these tables alone, e.g. features,models.")] = "",
+    variants: Annotated[
+        Path | None, Parameter(help="Of a project: a TOML file of tables; else configs/evaluation/default.toml.")
+    ] = None,
+    data: Data = None,
+    epoch: Epoch = None,
+    preset: Preset = None,
+    set_: Settings = (),
+    poses: Annotated[
+        Path | None, Parameter(help="A file of poses alone: as georef writes them, or a plain exterior orientation.")
+    ] = None,
     crs: Crs = None,
     height: Height = None,
     output: Annotated[
-        Path | None, Parameter(name=["--output", "-o"], help="JSON file; else evaluation.json beside the poses.")
+        Path | None,
+        Parameter(name=["--output", "-o"], help="Of a project: where all results go. Of poses: the JSON file."),
     ] = None,
 ) -> int:
-    """Compare poses with the truth: errors, shares within thresholds, and whether the covariances are true."""
-    from georef.stages.evaluate import describe, evaluate, parse_truth_sigma, write_evaluation
+    """Compare with the truth: variants of a project as tables, curves and a page, or one file of poses."""
+    from georef.stages.evaluate import describe, evaluate, one_of, parse_truth_sigma, write_evaluation
 
     sigmas = None if truth_sigma is None else parse_truth_sigma(truth_sigma)
-    result = evaluate(poses, truth, crs=crs, height=height, truth_sigmas=sigmas)
-    path = write_evaluation(result, output)
-    say(*describe(result), f"written     {path}")
+    one_of(project, poses)
+    if poses is not None:
+        result = evaluate(poses, truth, crs=crs, height=height, truth_sigmas=sigmas)
+        say(*describe(result), f"written     {write_evaluation(result, output)}")
+        return 0
+    assert project is not None
+    from georef.comparison.evaluate import compare, write_comparison
+    from georef.comparison.run import Source
+
+    source = Source(project, data, output, epoch, preset, set_)
+    wanted = [name.strip() for name in tables.split(",") if name.strip()]
+    executor = _executor(source.open()[0])
+    comparison = compare(source, truth, sigmas, variants=variants, wanted=wanted, executor=executor, say=say)
+    for table in comparison.tables:
+        say_table(table.to_dict())
+    say("", *(f"written     {path}" for path in write_comparison(comparison)))
     return 0
 
 

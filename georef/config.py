@@ -68,7 +68,7 @@ class CandidatesConfig(Section):
 
 
 class LocalizeConfig(Section):
-    method: Literal["query-centred", "published"] = "query-centred"
+    method: Literal["query-centred", "published", "global-model"] = "query-centred"
     ransac_gate_px: float = Field(default=12.0, gt=0)
     guided_gate: float = Field(default=3.0, gt=0)
     guided_min_similarity: float = Field(default=0.6, ge=0, le=1)
@@ -78,6 +78,13 @@ class LocalizeConfig(Section):
     max_position_sigma_m: float = Field(default=1.0, gt=0)
     max_correspondences: int = Field(default=0, ge=0)
     seed: int = 0
+
+
+class GlobalMapConfig(Section):
+    neighbours: int = Field(default=10, ge=1)
+    viewing_reach_m: float = Field(default=30.0, gt=0)
+    gate: float = Field(default=3.0, gt=0)
+    block_images: int = Field(default=100, ge=2)
 
 
 class NetworkConfig(Section):
@@ -130,6 +137,7 @@ class Config(Section):
     candidates: CandidatesConfig = CandidatesConfig()
     localize: LocalizeConfig = LocalizeConfig()
     network: NetworkConfig = NetworkConfig()
+    global_map: GlobalMapConfig = GlobalMapConfig()
     adjust: AdjustConfig = AdjustConfig()
     report: ReportConfig = ReportConfig()
     run: RunConfig = RunConfig()

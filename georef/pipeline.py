@@ -18,7 +18,7 @@ from georef.config import Config
 from georef.executor import Executor
 from georef.io.files import write_text_atomically
 from georef.project import Project
-from georef.stages import adjust, features, index, localize, network, report
+from georef.stages import adjust, features, global_map, index, localize, network, report
 from georef.stages.base import Meter, Run, StageContext, StageSummary
 from georef.stages.survey import Survey, load_survey
 from georef.types.campaign import Campaign
@@ -35,8 +35,9 @@ class Stage:
     version: int  # raise it when the same inputs give other results
     sections: tuple[str, ...]  # of the configuration, or section.key
     reads: Callable[[Project, Survey], dict[str, Any]]
-    needs: tuple[str, ...]  # stages before it
+    needs: tuple[str, ...]  # stages before it, where they are wanted
     run: Run
+    wanted: Callable[[Config], bool] = lambda config: True
     of_reference: bool = False  # looks at the reference alone: done once for all epochs
 
 
@@ -80,14 +81,26 @@ _NETWORK_KEYS = (
     "adjust.max_iterations",
 )
 
-_INDEX_KEYS = ("retrieval", "candidates.ranking")
+_MAP_KEYS = ("matching", "global_map")
 _LOCALIZE_KEYS = ("matching", "candidates", "localize")
+
+
+def _uses_index(config: Config) -> bool:
+    return config.candidates.ranking != "votes"
+
+
+def _uses_map(config: Config) -> bool:
+    return config.localize.method == "global-model"
+
 
 STAGES: tuple[Stage, ...] = (
     Stage("features", 1, ("features",), _all_images, (), features.run),
     Stage("network", 2, _NETWORK_KEYS, _reference_with_images, (), network.run, of_reference=True),
-    Stage("index", 1, _INDEX_KEYS, _reference_with_images, (), index.run, of_reference=True),
-    Stage("localize", 3, _LOCALIZE_KEYS, _epoch_files, ("features", "network", "index"), localize.run),
+    Stage("index", 1, ("retrieval",), _reference_with_images, (), index.run, _uses_index, of_reference=True),
+    Stage(
+        "global-map", 1, _MAP_KEYS, _reference_with_images, ("network",), global_map.run, _uses_map, of_reference=True
+    ),
+    Stage("localize", 3, _LOCALIZE_KEYS, _epoch_files, ("features", "network", "index", "global-map"), localize.run),
     Stage("adjust", 3, ("adjust", "localize", "matching"), _control, ("features", "network", "localize"), adjust.run),
     Stage("report", 1, ("report",), _check, ("features", "network", "localize", "adjust"), report.run),
 )
@@ -111,14 +124,17 @@ class StageResult:
     summary: StageSummary
     timing: dict[str, float]
     reused: bool
+    context: StageContext
 
 
-def run_pipeline(project: Project, epoch: str, executor: Executor) -> Iterator[StageResult]:
-    """Runs what is not done, stage by stage. Raises GeorefError."""
+def run_pipeline(project: Project, epoch: str, executor: Executor, last: str = "report") -> Iterator[StageResult]:
+    """Runs what is not done, stage by stage up to the one named `last`. Raises GeorefError."""
     survey = load_survey(project, epoch)
     plan = list(_plan(project, epoch, survey))  # as a whole: a component that cannot be made fails before any work
     for stage, folder, parts, before in plan:
         yield _run_stage(stage, StageContext(project, project.config, epoch, survey, executor, folder, before), parts)
+        if stage.name == last:
+            return
 
 
 def status(project: Project, epoch: str) -> list[StageState]:
@@ -136,13 +152,13 @@ def _plan(
     prints: dict[str, str] = {}
     version = features.extractor_version(project.config.features)
     before = {"store": project.feature_folder / _hash(version)[:12]}
-    for stage in STAGES:
+    for stage in (stage for stage in STAGES if stage.wanted(project.config)):
         parts = {
             "stage version": stage.version,
             "components": _components(stage, project.config),
             **{f"[{name}]": _setting(project.config, name) for name in stage.sections},
             **stage.reads(project, survey),
-            **{f"stage {name}": prints[name] for name in stage.needs},
+            **{f"stage {name}": prints[name] for name in stage.needs if name in prints},
         }
         prints[stage.name] = _hash(parts)[:12]
         folder = project.stage_folder(_scope(stage, epoch), stage.name, prints[stage.name])
@@ -160,6 +176,7 @@ def _components(stage: Stage, config: Config) -> str:
     versions = {
         "features": lambda: features.extractor_version(config.features),
         "index": lambda: index.descriptor_version(config),
+        "global-map": lambda: localize.matcher_version(config),
         "localize": lambda: localize.matcher_version(config),
     }
     return versions[stage.name]() if stage.name in versions else ""
@@ -169,7 +186,7 @@ def _run_stage(stage: Stage, context: StageContext, parts: dict[str, Any]) -> St
     done = _read_json(context.folder / DONE)
     if done is not None and _results_exist(context, stage.name):
         summary = StageSummary(done["line"], done["data"], 0, done["total"])
-        return StageResult(stage.name, summary, done["timing"], reused=True)
+        return StageResult(stage.name, summary, done["timing"], reused=True, context=context)
     context.folder.mkdir(parents=True, exist_ok=True)
     write_text_atomically(json.dumps(parts, indent=1), context.folder / BEGUN)
     meter = Meter()
@@ -185,7 +202,7 @@ def _run_stage(stage: Stage, context: StageContext, parts: dict[str, Any]) -> St
         "finished": time.strftime("%Y-%m-%dT%H:%M:%S%z"),
     }
     write_text_atomically(json.dumps(record, indent=1), context.folder / DONE)
-    return StageResult(stage.name, summary, timing, reused=False)
+    return StageResult(stage.name, summary, timing, reused=False, context=context)
 
 
 def _results_exist(context: StageContext, stage: str) -> bool:

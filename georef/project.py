@@ -202,6 +202,9 @@ class Project:
     def published(self, epoch: str) -> Path:
         return self.output / "epochs" / epoch
 
+    def evaluation(self, epoch: str) -> Path:
+        return self.output / "evaluation" / epoch
+
     def select_epoch(self, epoch: str | None) -> str:
         """The epoch that is named, or the only one there is."""
         names = list(self.file.epochs)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import os
 import sys
+from typing import Any
 
 from cyclopts import App, CycloptsError
 
@@ -12,11 +13,33 @@ from georef.errors import GeorefError
 
 _REFUSED_BY_THE_SYSTEM = (errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOSPC, errno.EDQUOT, errno.ENOTDIR)
 
+_WIDTH_IN_A_FILE = 180
+_TEXT_COLUMNS = ("name", "step", "what")
+
 
 def say(*lines: str) -> None:
     """Lines to the standard output, at once."""
     sys.stdout.write("".join(f"{line}\n" for line in lines))
     sys.stdout.flush()
+
+
+def say_table(table: dict[str, Any]) -> None:
+    """A table (headings, and rows of cells as pairs of value and interval), the interval below its value."""
+    from rich.box import SIMPLE_HEAD
+    from rich.console import Console
+    from rich.table import Table
+
+    console = Console(file=sys.stdout, highlight=False, width=None if sys.stdout.isatty() else _WIDTH_IN_A_FILE)
+    shown = Table(title=table["title"], box=SIMPLE_HEAD, title_justify="left", title_style="bold", pad_edge=False)
+    for column in table["columns"]:
+        left = not column["unit"] and column["key"] in _TEXT_COLUMNS
+        heading = column["heading"].replace(", ", ",\n").replace(" (", "\n(").replace(": ", ":\n")
+        shown.add_column(heading, justify="left" if left else "right", overflow="fold")
+    for row in table["shown"]:
+        shown.add_row(*(f"{value}\n{interval}" if interval else value for value, interval in row))
+    console.print(shown, markup=False)
+    for note in table["notes"]:
+        console.print(note, markup=False)
 
 
 def exit_code(app: App, arguments: list[str]) -> int:

@@ -42,13 +42,17 @@ ALLOWED: dict[str, set[str]] = {
         *("evaluation", "estimation", "capture", "simulate", "report", "viewer", "stages"),
     },
     "pipeline": {"errors", "config", "project", "executor", "types", "io", "stages"},
+    "comparison": {
+        *("errors", "config", "project", "executor", "geometry", "types", "crs", "io", "store", "evaluation", "report"),
+        *("stages", "pipeline"),
+    },
     "doctor": {"errors", "config", "project", "features", "stages"},
     "terminal": {"errors"},
     "cli_weights": {"errors", "terminal", "doctor", "features"},
     "cli_benchmark": {"errors", "terminal", "io", "benchmarks"},
     "cli": {
         *("errors", "terminal", "cli_weights", "cli_benchmark", "doctor", "project", "executor", "progress"),
-        *("pipeline", "stages", "viewer", "capture", "simulate"),
+        *("pipeline", "stages", "comparison", "viewer", "capture", "simulate"),
     },
 }
 FOLDER_NAMES = {"work", "epochs", "campaigns"}  # inside a project

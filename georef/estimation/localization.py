@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -13,6 +12,7 @@ from numpy.typing import NDArray
 from georef.config import CandidatesConfig, LocalizeConfig
 from georef.estimation.candidates import Box, overlap, search_box
 from georef.estimation.first_pose import FirstPose, QueryImage, ransac_pose
+from georef.estimation.global_model import global_model, one_point_each
 from georef.estimation.guided import GuidedOptions, PosedFeatures, guided_matches
 from georef.estimation.local_model import LocalModel, query_centred_model
 from georef.estimation.pnp import EstimatedPose, refine_pose, refit_pose, with_covariance
@@ -20,6 +20,7 @@ from georef.estimation.prior_check import against_prior
 from georef.estimation.published import VerifyPair, published_model, verify_pair
 from georef.estimation.reference_map import ReferenceMap
 from georef.estimation.search import FindSimilar, Search
+from georef.estimation.timer import StepTimer
 from georef.features.base import Matcher
 from georef.geometry.camera import Camera
 from georef.geometry.rigid import Rigid3
@@ -44,6 +45,7 @@ class _Work:
     cpu_s: dict[str, float] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
     pairs: dict[int, Matches] = field(default_factory=dict)
+    tried: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         self.use(self.image.camera)
@@ -54,8 +56,8 @@ class _Work:
         sigma = self.reference.noise.keypoint_sigma * self.features.scales_px.astype(np.float64)
         self.query = QueryImage(camera, self.posed.pixels, sigma)
 
-    def timed(self, step: str) -> _Timer:
-        return _Timer(self.cpu_s, step)
+    def timed(self, step: str) -> StepTimer:
+        return StepTimer(self.cpu_s, step)
 
 
 def localize_image(
@@ -84,7 +86,8 @@ def localize_image(
             f"inside the search box: {outcome.reason.value} ({outcome.detail}); tried the whole reference"
         )
         outcome = _localize_in(work, search_box(search.positions, None, candidates))
-    return replace(against_prior(outcome, image, config), notes=tuple(work.notes))
+    judged = against_prior(outcome, image, config)
+    return replace(judged, notes=tuple(work.notes), cpu_s=dict(work.cpu_s), candidates=work.tried)
 
 
 def _localize_in(work: _Work, box: Box) -> Outcome:
@@ -96,8 +99,8 @@ def _localize_in(work: _Work, box: Box) -> Outcome:
         work.notes.append(note)
     if len(ranked) < 2:
         return Rejected(work.image.image_id, RejectReason.NO_CANDIDATES, f"{len(ranked)} reference images")
-    method = _published if work.config.method == "published" else _query_centred
-    return method(work, ranked)
+    work.tried = tuple(work.reference.images[int(i)].image_id for i in ranked[: work.search.config.count])
+    return _METHODS[work.config.method](work, ranked)
 
 
 def _query_centred(work: _Work, ranked: NDArray[np.int64]) -> Outcome:
@@ -197,6 +200,21 @@ def _published(work: _Work, ranked: NDArray[np.int64]) -> Outcome:
     references = [work.reference.posed(i) for i in chosen]
     with work.timed("matching"):
         model = published_model(references, _pair_verifier(work, chosen, references), work.reference.noise)
+    return _posed_by_ransac(work, model, chosen)
+
+
+def _global_model(work: _Work, ranked: NDArray[np.int64]) -> Outcome:
+    """The query matched with its candidates; points of the precomputed map by the keypoints that it matches there."""
+    candidates = sorted(int(i) for i in ranked[: work.candidates.count])
+    matches = {index: _matched(work, index) for index in candidates}
+    with work.timed("map points"):
+        structures = {index: work.reference.structure(index) for index in candidates}
+        model, chosen = global_model(structures, matches, work.reference.views)
+    return _posed_by_ransac(work, model, chosen)
+
+
+def _posed_by_ransac(work: _Work, model: LocalModel, chosen: Sequence[int]) -> Outcome:
+    """RANSAC and COLMAP's refinement on its inliers, one point a keypoint; then the covariance."""
     with work.timed("pose"):
         if len(model) < work.config.min_inliers:
             return Rejected(work.image.image_id, RejectReason.FEW_MATCHES, f"{len(model)} triangulated points")
@@ -204,11 +222,12 @@ def _published(work: _Work, ranked: NDArray[np.int64]) -> Outcome:
         if isinstance(found, Rejected):
             return found
         pose, covs = found.world_from_cam, lambda v: work.reference.pose_cov(chosen[v])
+        used = one_point_each(pose, work.query, model, found.inliers)
         if work.image.camera.estimate:  # COLMAP has estimated no covariance, and no distortion
-            model = model.take(found.inliers)
+            model = model.take(used)
             estimate = refine_pose(pose, work.query, model, covs)
         else:
-            estimate = with_covariance(pose, work.query, model, found.inliers, covs)
+            estimate = with_covariance(pose, work.query, model, used, covs)
     return _outcome(work, estimate, model, chosen)
 
 
@@ -278,14 +297,8 @@ def _reference_matches(model: LocalModel, ids: Sequence[str]) -> tuple[Reference
     return tuple(ReferenceMatches(name, pairs[obs.view == i]) for i, name in enumerate(ids) if (obs.view == i).any())
 
 
-class _Timer:
-    """Adds the CPU seconds of a block to a step."""
-
-    def __init__(self, times: dict[str, float], step: str) -> None:
-        self.times, self.step = times, step
-
-    def __enter__(self) -> None:
-        self.start = time.process_time()
-
-    def __exit__(self, *_: object) -> None:
-        self.times[self.step] = self.times.get(self.step, 0.0) + time.process_time() - self.start
+_METHODS: dict[str, Callable[[_Work, NDArray[np.int64]], Outcome]] = {
+    "query-centred": _query_centred,
+    "published": _published,
+    "global-model": _global_model,
+}

@@ -45,7 +45,7 @@ def published_model(references: Sequence[PosedFeatures], verify: VerifyPair, noi
     for a, b in combinations(range(len(references)), 2):
         graph.add_two_view_geometry(a + 1, b + 1, verify(a, b))
     graph.finalize()
-    reconstruction = _triangulated(references, graph)
+    reconstruction = triangulated(references, graph)
     to_query = [_with_query(verify(a, len(references)), a) for a in range(len(references))]
     return _model_of_query(references, reconstruction, np.concatenate(to_query), noise)
 
@@ -56,7 +56,7 @@ def _with_query(geometry: pycolmap.TwoViewGeometry, reference: int) -> NDArray[n
     return np.column_stack([np.full(len(verified), reference), verified])
 
 
-def _triangulated(references: Sequence[PosedFeatures], graph: pycolmap.CorrespondenceGraph) -> pycolmap.Reconstruction:
+def triangulated(references: Sequence[PosedFeatures], graph: pycolmap.CorrespondenceGraph) -> pycolmap.Reconstruction:
     """Points from the references at their given poses."""
     reconstruction = pycolmap.Reconstruction()
     for index, reference in enumerate(references):

@@ -16,9 +16,13 @@ from georef.geometry.rigid import Array, Rigid3
 from georef.types.campaign import Campaign, Image
 from georef.types.features import Features
 from georef.types.results import ReferenceNoise
+from georef.types.scene import ImageStructure
 
 FeatureReader = Callable[[str, int | None], Features]
 """Features of an image id; the second argument reads only that many of the best."""
+
+StructureReader = Callable[[int], ImageStructure]
+"""What the precomputed map holds of a reference image, by its place among all of them."""
 
 _KEPT_IMAGES = 64
 
@@ -26,7 +30,13 @@ _KEPT_IMAGES = 64
 class ReferenceMap:
     """Posed reference images with lazily read features; the most recently used ones are kept."""
 
-    def __init__(self, campaign: Campaign, read_features: FeatureReader, noise: ReferenceNoise) -> None:
+    def __init__(
+        self,
+        campaign: Campaign,
+        read_features: FeatureReader,
+        noise: ReferenceNoise,
+        read_structure: StructureReader | None = None,  # of the precomputed map, where there is one
+    ) -> None:
         self.images: tuple[Image, ...] = tuple(image for image in campaign.images if image.world_from_cam is not None)
         self.poses: list[Rigid3] = [image.world_from_cam for image in self.images if image.world_from_cam is not None]
         self.noise = noise
@@ -35,9 +45,10 @@ class ReferenceMap:
         self.headings_rad: Array = np.arctan2(forward[:, 0], forward[:, 1])
         self.epochs: NDArray[np.str_] = np.array([image.epoch for image in self.images], dtype=str)
         self.pairs: dict[tuple[int, int], Any] = {}  # verified pairs of references, filled by the published way
-        self._read = read_features
+        self._read, self._read_structure = read_features, read_structure
         self._heads: OrderedDict[tuple[int, int], Features] = OrderedDict()
         self._posed: OrderedDict[int, PosedFeatures] = OrderedDict()
+        self._structures: OrderedDict[int, ImageStructure] = OrderedDict()
 
     def __len__(self) -> int:
         return len(self.images)
@@ -55,6 +66,13 @@ class ReferenceMap:
             _KEPT_IMAGES,
             lambda: PosedFeatures.of(self._read(image.image_id, None), image.camera, self.poses[index]),
         )
+
+    def structure(self, index: int) -> ImageStructure:
+        """The points of the precomputed map that a reference image sees; ValueError where there is no such map."""
+        if self._read_structure is None:
+            raise ValueError("this reference has no precomputed map")
+        read = self._read_structure
+        return _remember(self._structures, index, _KEPT_IMAGES, lambda: read(index))
 
     def views(self, indices: Sequence[int]) -> Views:
         return Views.of([self.poses[i] for i in indices], [self.images[i].camera for i in indices])

@@ -18,6 +18,7 @@ from georef.evaluation.statistics import (
     median_interval,
     nees,
     summarize_nees,
+    wilson_interval,
 )
 from georef.geometry.rigid import Array, Rigid3, rotation_angle
 from georef.types.campaign import require_covariance
@@ -119,6 +120,7 @@ class Recall:
     position_m: float
     rotation_deg: float
     percent: float  # NaN without images
+    interval: Interval | None  # 95 %, Wilson; None without images
 
 
 @dataclass(frozen=True, eq=False)
@@ -152,7 +154,12 @@ class PoseErrors:
             "mean_offset_m": finite_list(self.mean_offset_m),
             "rmse_offset_m": finite_list(self.rmse_offset_m),
             "recall": [
-                {"position_m": r.position_m, "rotation_deg": r.rotation_deg, "percent": finite(r.percent)}
+                {
+                    "position_m": r.position_m,
+                    "rotation_deg": r.rotation_deg,
+                    "percent": finite(r.percent),
+                    "interval_95": finite_list(r.interval),
+                }
                 for r in self.recall
             ],
             "nees": self.nees.to_dict(),
@@ -224,7 +231,8 @@ def _summarize(errors: tuple[PoseError, ...], without_truth: tuple[str, ...]) ->
 
 def _recall(position_m: Array, rotation_deg: Array, limit_m: float, limit_deg: float) -> Recall:
     within = (position_m <= limit_m) & (rotation_deg <= limit_deg)
-    return Recall(limit_m, limit_deg, 100.0 * float(within.mean()) if len(within) else np.nan)
+    percent = 100.0 * float(within.mean()) if len(within) else np.nan
+    return Recall(limit_m, limit_deg, percent, wilson_interval(int(within.sum()), len(within)))
 
 
 def _median(values: Array) -> float:

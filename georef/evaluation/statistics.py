@@ -106,6 +106,20 @@ def median_interval(values: ArrayLike) -> Interval | None:
     return (float(ordered[rank - 1]), float(ordered[-rank])) if rank >= 1 else None
 
 
+def wilson_interval(count: int, total: int) -> Interval | None:
+    """95 % interval of a share, in percent, of which `count` of `total` were observed; None for no trials.
+
+    Wilson (1927): the shares p with |count / total - p| <= z sqrt(p (1 - p) / total).
+    """
+    if total == 0:
+        return None
+    share, z2 = count / total, float(chi2.ppf(_TAILS[1] - _TAILS[0], 1))
+    middle = share + z2 / (2 * total)
+    half = np.sqrt(z2 * (share * (1.0 - share) / total + z2 / (4.0 * total * total)))
+    low, high = (100.0 * float((middle + sign * half) / (1.0 + z2 / total)) for sign in (-1.0, 1.0))
+    return max(low, 0.0), min(high, 100.0)
+
+
 def rmse_interval(errors: Array) -> Interval | None:
     """95 % interval of the root mean square length of errors (N, k); None without errors.
 

@@ -56,7 +56,7 @@ def write_outcome(path: Path, outcome: Outcome) -> None:
     """Stores the outcome of one image."""
     if isinstance(outcome, Rejected):
         header = {"image_id": outcome.image_id, "reason": outcome.reason.value, "detail": outcome.detail}
-        write_item(path, {**header, "notes": outcome.notes}, {})
+        write_item(path, {**header, **_told(outcome)}, {})
         return
     header = {
         "image_id": outcome.image_id,
@@ -65,8 +65,7 @@ def write_outcome(path: Path, outcome: Outcome) -> None:
         "references": [m.reference_id for m in outcome.matches],
         "gnss_rejected": outcome.gnss_rejected,
         "gnss_offset_m": outcome.gnss_offset_m,
-        "notes": outcome.notes,
-        "cpu_s": outcome.cpu_s,
+        **_told(outcome),
     }
     arrays = {
         "world_from_cam": outcome.world_from_cam.matrix(),
@@ -81,9 +80,13 @@ def write_outcome(path: Path, outcome: Outcome) -> None:
 def read_outcome(path: Path) -> Outcome:
     """The stored outcome of one image."""
     header, arrays = read_item(path)
-    notes = tuple(header["notes"])
+    told = {
+        "notes": tuple(header["notes"]),
+        "cpu_s": header["cpu_s"],
+        "candidates": tuple(header["candidates"]),
+    }
     if "reason" in header:
-        return Rejected(header["image_id"], RejectReason(header["reason"]), header["detail"], notes)
+        return Rejected(header["image_id"], RejectReason(header["reason"]), header["detail"], **told)
     matches = (ReferenceMatches(name, arrays[f"matches_{i}"]) for i, name in enumerate(header["references"]))
     return Localized(
         image_id=header["image_id"],
@@ -97,6 +100,10 @@ def read_outcome(path: Path) -> Outcome:
         keypoints=arrays["keypoints"],
         gnss_rejected=header["gnss_rejected"],
         gnss_offset_m=header["gnss_offset_m"],
-        notes=notes,
-        cpu_s=header["cpu_s"],
+        **told,
     )
+
+
+def _told(outcome: Outcome) -> dict[str, Any]:
+    """What both kinds of outcome say of how they came about."""
+    return {"notes": outcome.notes, "cpu_s": outcome.cpu_s, "candidates": outcome.candidates}

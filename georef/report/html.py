@@ -24,11 +24,12 @@ def render_html(report: dict[str, Any]) -> str:
         kind["residual_figures"] = residual_figures(kind["all_points"], values["axes"])
     stations = [] if values["kinds"] else plan_figures(report["plan"], None, values["axes"])
     limits = {"most_stations": MOST_STATIONS, "most_points": MOST_POINTS}
-    return _template().render(report=report, stations=stations, **limits, **values)
+    return page_template("report.html.j2").render(report=report, stations=stations, **limits, **values)
 
 
 @cache
-def _template() -> Template:
+def page_template(name: str) -> Template:
+    """A page of the folder `templates`, with the filters for numbers."""
     environment = Environment(
         loader=PackageLoader("georef.report"),
         autoescape=True,
@@ -37,7 +38,7 @@ def _template() -> Template:
         lstrip_blocks=True,
     )
     environment.filters |= {"mm": millimetres, "number": number, "whole": whole, "span": span, "signed_mm": signed_mm}
-    return environment.get_template("report.html.j2")
+    return environment.get_template(name)
 
 
 def number(value: float | None, digits: int = 1) -> str:

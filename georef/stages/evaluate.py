@@ -22,7 +22,7 @@ from georef.io.poses import read_poses
 from georef.io.tables import read_table
 from georef.stages.survey import world_poses
 
-RESULT = "evaluation.json"
+RESULT = "evaluation-{}.json"  # of the stem of the poses' file, so that each has its own
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,9 +77,20 @@ def evaluate(
 
 def write_evaluation(evaluation: Evaluation, path: Path | None = None) -> Path:
     """Writes the JSON, beside the poses unless told otherwise, and returns its path."""
-    path = path or evaluation.poses.parent / RESULT
+    path = path or evaluation.poses.parent / RESULT.format(evaluation.poses.stem)
     write_text_atomically(json.dumps(evaluation.to_dict(), indent=1, allow_nan=False), path)
     return path
+
+
+def one_of(project: Path | None, poses: Path | None) -> None:
+    """Raises ConfigError unless either a project or a file of poses is named."""
+    if (project is None) == (poses is None):
+        raise ConfigError(
+            "Neither a project nor a file of poses is named."
+            if poses is None
+            else "Both a project and --poses are named.",
+            "Expected one of them: georef evaluate PROJECT --truth FILE, or --poses FILE --truth FILE.",
+        )
 
 
 def parse_truth_sigma(text: str) -> TruthSigmas:

@@ -32,8 +32,6 @@ logger = logging.getLogger(__name__)
 
 def run(context: StageContext) -> StageSummary:
     """Learns the global descriptor where it must be learned, and describes what is not yet in the database."""
-    if context.config.candidates.ranking == "votes":
-        return StageSummary("not needed: references are ranked by votes")
     failed = failed_images(context.before["features"])
     images = [image for image in context.survey.reference.images if feature_id(image) not in failed]
     task = DescribeTask(context.config.retrieval, context.before["store"], context.folder / STATE)
@@ -48,8 +46,8 @@ def run(context: StageContext) -> StageSummary:
 
 
 def descriptor_version(config: Config) -> str:
-    """What decides the descriptors beside the images and what is learned from them; "" where votes rank alone."""
-    return "" if config.candidates.ranking == "votes" else _made(config.retrieval).version()
+    """What decides the descriptors beside the images and what is learned from them."""
+    return _made(config.retrieval).version()
 
 
 def open_vectors(folder: Path, descriptor: GlobalDescriptor) -> VectorIndex:

@@ -18,6 +18,7 @@ from georef.features.base import Matcher
 from georef.features.images import UnreadableImage
 from georef.features.registry import MATCHERS, load_component
 from georef.io.items import item_ids, item_path, read_outcome, write_outcome
+from georef.io.structures import read_structure
 from georef.stages.base import StageContext, StageSummary, feature_id, open_features
 from georef.stages.features import failed_images
 from georef.stages.index import SimilarImages, open_index
@@ -25,8 +26,9 @@ from georef.stages.network import read_noise
 from georef.types.campaign import Campaign, Image
 from georef.types.features import Features
 from georef.types.results import Localized, Outcome, ReferenceNoise, Rejected, RejectReason
+from georef.types.scene import ImageStructure
 
-ITEMS = "items"
+ITEMS, STRUCTURE = "items", "structure"
 logger = logging.getLogger(__name__)
 
 
@@ -39,11 +41,12 @@ class LocalizeTask:
     store_folder: Path
     config: Config
     failed: dict[str, tuple[str, str]]
-    index_folder: Path
+    index_folder: Path | None  # of the vector database, where the ranking needs one
+    map_folder: Path | None  # of the precomputed map, where the method needs one
 
     @cached_property
     def similar(self) -> SimilarImages | None:
-        if self.config.candidates.ranking == "votes":
+        if self.index_folder is None:
             return None
         return open_index(self.index_folder, self.store_folder, self.config, self.map.images)
 
@@ -55,7 +58,13 @@ class LocalizeTask:
         def read(image_id: str, count: int | None) -> Features:
             return store.read(keys[image_id], count)
 
-        return ReferenceMap(self.reference, read, self.noise)
+        folder, places = self.map_folder, {image.image_id: k for k, image in enumerate(self.reference.images)}
+
+        def structure(index: int) -> ImageStructure:
+            assert folder is not None
+            return read_structure(item_path(folder / STRUCTURE, self.reference.images[index].image_id), places)
+
+        return ReferenceMap(self.reference, read, self.noise, None if folder is None else structure)
 
     @cached_property
     def matcher(self) -> Matcher:
@@ -105,10 +114,9 @@ def make_task(context: StageContext) -> LocalizeTask:
     usable = tuple(i for i in reference.images if i.image_id not in suspects and feature_id(i) not in failed)
     if len(usable) < 2:
         raise StageError(f"Only {len(usable)} reference images can be used, at least two are needed.")
-    folders = context.before
-    return LocalizeTask(
-        Campaign(reference.epoch, usable), noise, folders["store"], context.config, failed, folders["index"]
-    )
+    campaign, folders = Campaign(reference.epoch, usable), context.before
+    index, precomputed = folders.get("index"), folders.get("global-map")
+    return LocalizeTask(campaign, noise, folders["store"], context.config, failed, index, precomputed)
 
 
 def outcomes_exist(context: StageContext) -> bool:

@@ -55,6 +55,7 @@ class Localized:
     cpu_s: dict[str, float] = field(default_factory=dict)
     camera: Camera | None = None  # as estimated, where the image's own is not known
     intrinsics_cov: Array | None = None  # (q, q) of camera.estimate; focal as its logarithm
+    candidates: tuple[str, ...] = ()  # references that were tried, the most promising first
 
     @property
     def intrinsic_sigmas(self) -> dict[str, tuple[float, float]]:
@@ -74,6 +75,8 @@ class Rejected:
     reason: RejectReason
     detail: str
     notes: tuple[str, ...] = ()
+    cpu_s: dict[str, float] = field(default_factory=dict)
+    candidates: tuple[str, ...] = ()  # references that were tried, the most promising first
 
 
 Outcome = Localized | Rejected

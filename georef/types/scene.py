@@ -42,3 +42,17 @@ class Observations:
     def scaled(self, factor: float) -> Observations:
         """The same observations with all sigmas multiplied by a factor."""
         return Observations(self.point, self.view, self.pixel, self.sigma_px * factor, self.keypoint)
+
+
+@dataclass(frozen=True, eq=False)
+class ImageStructure:
+    """The map points that keypoints of one reference image belong to, each with all observations of its track."""
+
+    keypoint: NDArray[np.int64]  # (P,) of this image, rising
+    identity: NDArray[np.int64]  # (P, 2) first observation of the track: image, keypoint; the same from every image
+    points: Array  # (P, 3) in world
+    cov: Array  # (P, 3, 3) of the image noise
+    observations: Observations  # view is the place of an image among all references
+
+    def __len__(self) -> int:
+        return len(self.keypoint)
