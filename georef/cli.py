@@ -11,18 +11,31 @@ import sys
 import time
 from collections.abc import Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import App, Parameter
 
 from georef import __version__
 from georef.cli_benchmark import benchmark
+from georef.cli_evaluate import evaluate
+from georef.cli_options import (
+    ANYWHERE,
+    AS_DECLARED,
+    REPEATED,
+    Choice,
+    Crs,
+    Epoch,
+    Height,
+    OptionalProject,
+    Place,
+    ProjectArgument,
+    executor_of,
+)
 from georef.cli_weights import weights
-from georef.terminal import exit_code, say, say_table
+from georef.terminal import exit_code, say
 
 if TYPE_CHECKING:
     from georef.doctor import Finding
-    from georef.executor import Executor
     from georef.project import Project
 
 app = App(
@@ -34,16 +47,7 @@ app = App(
 )
 app.command(weights)
 app.command(benchmark)
-
-_REPEATED: Any = {"consume_multiple": False, "negative": (), "show_default": False}
-ProjectArgument = Annotated[Path, Parameter(help="Project folder, or its project.toml.")]
-Data = Annotated[Path | None, Parameter(name="--data", help="Folder with the data; else GEOREF_DATA.")]
-Output = Annotated[Path | None, Parameter(name=["--output", "-o"], help="Where all results go; else the project.")]
-Epoch = Annotated[str | None, Parameter(help="Epoch to work on; needed where the project has several.")]
-Preset = Annotated[str | None, Parameter(help="A preset of configs/, or the path of a TOML file.")]
-Settings = Annotated[tuple[str, ...], Parameter(name="--set", help="section.key=value, may be repeated.", **_REPEATED)]
-Crs = Annotated[str | None, Parameter(name="--crs", help="EPSG:code or local; else what the files declare.")]
-Height = Annotated[str | None, Parameter(help="ellipsoidal, or a vertical CRS; else what the files declare.")]
+app.command(evaluate)
 
 
 @app.command
@@ -61,7 +65,7 @@ def init(
         Literal["absolute", "relative"] | None, Parameter(help="Check points: surveyed, or from the reference.")
     ] = None,
     column: Annotated[
-        tuple[str, ...], Parameter(help="easting=X: which column is which; may be repeated.", **_REPEATED)
+        tuple[str, ...], Parameter(help="easting=X: which column is which; may be repeated.", **REPEATED)
     ] = (),
     name: Annotated[str | None, Parameter(help="Name of the project; else that of the folder of the data.")] = None,
 ) -> int:
@@ -76,12 +80,10 @@ def init(
 
 @app.command
 def doctor(
-    project: Annotated[Path | None, Parameter(help="Project folder, or its project.toml.")] = None,
+    project: OptionalProject = None,
     *,
-    data: Data = None,
-    output: Output = None,
-    preset: Preset = None,
-    set_: Settings = (),
+    place: Place = ANYWHERE,
+    choice: Choice = AS_DECLARED,
 ) -> int:
     """Check this machine and, if one is named, a project with all its tables."""
     from georef.doctor import check_machine, check_project, check_space
@@ -90,10 +92,7 @@ def doctor(
     if project is None:
         levels |= _report_findings([check_space(Path.cwd())])
         return int("fail" in levels)
-    from georef.project import open_project
-
-    opened = open_project(project, data=data, output=output, preset=preset, settings=set_)
-    levels |= _report_findings(check_project(opened))
+    levels |= _report_findings(check_project(place.open(project, choice.preset, choice.set_)))
     return int("fail" in levels)
 
 
@@ -101,14 +100,13 @@ def doctor(
 def run(
     project: ProjectArgument,
     *,
-    data: Data = None,
-    output: Output = None,
+    place: Place = ANYWHERE,
     epoch: Epoch = None,
-    preset: Preset = None,
-    set_: Settings = (),
+    choice: Choice = AS_DECLARED,
 ) -> int:
     """Localize, adjust and report one epoch; what is done already is kept."""
-    return _run(*_open(project, data, output, epoch, preset, set_))
+    opened = place.open(project, choice.preset, choice.set_)
+    return _run(opened, opened.select_epoch(epoch))
 
 
 @app.command
@@ -121,18 +119,16 @@ def demo(
     ] = False,
     seed: Annotated[int, Parameter(help="Of the street and all its errors.")] = 0,
     change: Annotated[float, Parameter(help="0 to 1: how much changes between the epochs.")] = 1.0,
-    preset: Preset = None,
-    set_: Settings = (),
+    choice: Choice = AS_DECLARED,
 ) -> int:
     """Render a street in two epochs, localize the second against the first, and compare with the exact truth."""
-    from georef.project import open_project
     from georef.stages.demo import against_truth, demo_options, render_missing, survey_files
 
     options = demo_options(seed, change, large=large, evaluation=evaluation)
     folder = survey_files(options)
-    project = open_project(folder, data=folder, output=output, preset=preset, settings=set_)
+    project = Place(folder, output).open(folder, choice.preset, choice.set_)
     start = time.process_time()
-    street = render_missing(options, folder, _executor(project))
+    street = render_missing(options, folder, executor_of(project))
     cost = f"{street.computed} rendered, {time.process_time() - start:.0f} CPU-s" if street.computed else "kept"
     say(f"{'render':<9} {street.line}  [{cost}]")
     code = 0
@@ -147,17 +143,16 @@ def demo(
 def status(
     project: ProjectArgument,
     *,
-    data: Data = None,
-    output: Output = None,
+    place: Place = ANYWHERE,
     epoch: Epoch = None,
-    preset: Preset = None,
-    set_: Settings = (),
+    choice: Choice = AS_DECLARED,
 ) -> int:
     """What is done, partial or stale, and why."""
     from georef.pipeline import DONE
     from georef.pipeline import status as stage_states
 
-    opened, name = _open(project, data, output, epoch, preset, set_)
+    opened = place.open(project, choice.preset, choice.set_)
+    name = opened.select_epoch(epoch)
     say(f"project {opened.file.name}, epoch {name}, results in {opened.output}", "")
     say(f"{'stage':<9} {'state':<8} why or what", f"{'-' * 9} {'-' * 8} {'-' * 40}")
     for state in stage_states(opened, name):
@@ -169,14 +164,14 @@ def status(
 def report(
     project: ProjectArgument,
     *,
-    data: Data = None,
-    output: Output = None,
+    place: Place = ANYWHERE,
     epoch: Epoch = None,
 ) -> int:
     """Render report.html again from report.json, and say where everything is."""
     from georef.stages.published import render_again
 
-    opened, name = _open(project, data, output, epoch, None, ())
+    opened = place.open(project)
+    name = opened.select_epoch(epoch)
     render_again(opened.published(name))
     _say_published(opened, name)
     return 0
@@ -186,8 +181,7 @@ def report(
 def view(
     project: ProjectArgument,
     *,
-    data: Data = None,
-    output: Output = None,
+    place: Place = ANYWHERE,
     epoch: Epoch = None,
     port: Annotated[int, Parameter(help="Port on 127.0.0.1 that the viewer listens on.")] = 9876,
 ) -> int:
@@ -195,72 +189,9 @@ def view(
     from georef.stages.report import RECORDING
     from georef.viewer.show import show_recording
 
-    opened, name = _open(project, data, output, epoch, None, ())
-    show_recording(opened.published(name) / RECORDING, port)
+    opened = place.open(project)
+    show_recording(opened.published(opened.select_epoch(epoch)) / RECORDING, port)
     return 0
-
-
-@app.command
-def evaluate(
-    project: Annotated[Path | None, Parameter(help="Project folder, or its project.toml; or name --poses.")] = None,
-    *,
-    truth: Annotated[Path, Parameter(help="True exterior orientation of the same images.")],
-    truth_sigma: Annotated[
-        str | None, Parameter(help="How well the truth is known: POSITION_M,ROTATION_DEG, 1-sigma per axis.")
-    ] = None,
-    tables: Annotated[str, Parameter(help="Of a project: these tables alone, e.g. features,models.")] = "",
-    variants: Annotated[
-        Path | None, Parameter(help="Of a project: a TOML file of tables; else configs/evaluation/default.toml.")
-    ] = None,
-    data: Data = None,
-    epoch: Epoch = None,
-    preset: Preset = None,
-    set_: Settings = (),
-    poses: Annotated[
-        Path | None, Parameter(help="A file of poses alone: as georef writes them, or a plain exterior orientation.")
-    ] = None,
-    crs: Crs = None,
-    height: Height = None,
-    output: Annotated[
-        Path | None,
-        Parameter(name=["--output", "-o"], help="Of a project: where all results go. Of poses: the JSON file."),
-    ] = None,
-) -> int:
-    """Compare with the truth: variants of a project as tables, curves and a page, or one file of poses."""
-    from georef.stages.evaluate import describe, evaluate, one_of, parse_truth_sigma, write_evaluation
-
-    sigmas = None if truth_sigma is None else parse_truth_sigma(truth_sigma)
-    one_of(project, poses)
-    if poses is not None:
-        result = evaluate(poses, truth, crs=crs, height=height, truth_sigmas=sigmas)
-        say(*describe(result), f"written     {write_evaluation(result, output)}")
-        return 0
-    assert project is not None
-    from georef.comparison.evaluate import compare, write_comparison
-    from georef.comparison.run import Source
-
-    source = Source(project, data, output, epoch, preset, set_)
-    wanted = [name.strip() for name in tables.split(",") if name.strip()]
-    executor = _executor(source.open()[0])
-    comparison = compare(source, truth, sigmas, variants=variants, wanted=wanted, executor=executor, say=say)
-    for table in comparison.tables:
-        say_table(table.to_dict())
-    say("", *(f"written     {path}" for path in write_comparison(comparison)))
-    return 0
-
-
-def _open(
-    project: Path,
-    data: Path | None,
-    output: Path | None,
-    epoch: str | None,
-    preset: str | None,
-    settings: tuple[str, ...],
-) -> tuple[Project, str]:
-    from georef.project import open_project
-
-    opened = open_project(project, data=data, output=output, preset=preset, settings=settings)
-    return opened, opened.select_epoch(epoch)
 
 
 def _run(project: Project, epoch: str) -> int:
@@ -268,7 +199,7 @@ def _run(project: Project, epoch: str) -> int:
     from georef.pipeline import run_pipeline
 
     report = None
-    for result in run_pipeline(project, epoch, _executor(project)):
+    for result in run_pipeline(project, epoch, executor_of(project)):
         cost = (
             "kept" if result.reused else f"{result.timing['cpu_s']:.0f} CPU-s, {result.timing['peak_memory_mb']:.0f} MB"
         )
@@ -276,19 +207,6 @@ def _run(project: Project, epoch: str) -> int:
         report = result.summary.data
     _say_published(project, epoch)
     return 3 if report is not None and report["images"]["localized"] == 0 else 0
-
-
-def _executor(project: Project) -> Executor:
-    from georef.executor import Executor
-
-    return Executor(project.config.run.workers, project.config.run.threads, _progress())
-
-
-def _progress():
-    """A bar on a terminal; a line every half minute where output is a file."""
-    from georef.progress import Bars, Lines
-
-    return Bars() if sys.stderr.isatty() else Lines()
 
 
 def _report_findings(findings: Iterable[Finding]) -> set[str]:

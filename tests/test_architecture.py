@@ -50,9 +50,11 @@ ALLOWED: dict[str, set[str]] = {
     "terminal": {"errors"},
     "cli_weights": {"errors", "terminal", "doctor", "features"},
     "cli_benchmark": {"errors", "terminal", "io", "benchmarks"},
+    "cli_options": {"executor", "progress", "project"},
+    "cli_evaluate": {"cli_options", "comparison", "stages", "terminal"},
     "cli": {
-        *("errors", "terminal", "cli_weights", "cli_benchmark", "doctor", "project", "executor", "progress"),
-        *("pipeline", "stages", "comparison", "viewer", "capture", "simulate"),
+        *("errors", "terminal", "cli_options", "cli_weights", "cli_benchmark", "cli_evaluate", "doctor", "project"),
+        *("pipeline", "stages", "viewer", "capture", "simulate"),
     },
 }
 FOLDER_NAMES = {"work", "epochs", "campaigns"}  # inside a project
