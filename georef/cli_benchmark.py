@@ -42,7 +42,7 @@ def features(
     scratch: Scratch = None,
     output: Output = None,
 ) -> int:
-    """The feature store against exact storage and numpy's archives: rates, memory, disk; 18 GB of scratch."""
+    """The feature store against exact storage and numpy's archives: rates, memory, disk; 7 GB of scratch."""
     from georef.benchmarks import features as bench
 
     return _measure(lambda folder: bench.run(images, keypoints, folder), bench.describe, scratch, output)
