@@ -22,7 +22,7 @@ class PixelDescriptor:
     """Prepares images, runs the network on those of equal size together, and brings rows to unit length.
 
     network: (N, 3, h, w) as `prepare` made them, on the device, to rows (N, size). prepare: an image (H, W, 3) uint8 to
-    (3, h, w) float32 in [0, 1], or ValueError. weights: entries of the weights table that made the network, for the version.
+    (3, h, w) float32 in [0, 1], or ValueError. weights: entries of the weights table behind it, for the version.
     device: "cpu", "cuda", or "auto".
     """
 
