@@ -32,7 +32,7 @@ def dinov2_layout(width: int = 768, depth: int = 12, gated: bool = False) -> Lay
         "norm.weight": (width,),
         "norm.bias": (width,),
     }
-    hidden = {1536: 4096, 48: 128}.get(width, 4 * width)
+    hidden = {1536: 4096, 48: 128}[width] if gated else 4 * width
     for i in range(depth):
         block: Layout = {
             "norm1.weight": (width,),
@@ -136,7 +136,7 @@ def write_netvlad(path: Path, size: int, seed: int = 0) -> dict[str, np.ndarray]
     scores, centres = array(512, 64, fan_in=4), array(512, 64, fan_in=512)
     whitening, offset = array(1, 1, 32768, size, fan_in=1), array(1, size, fan_in=10_000)
     layers[30], layers[33] = _layer(scores, centres), _layer(whitening, offset)
-    mean = np.broadcast_to(np.float32([123.7, 116.8, 103.9]), (4, 4, 3)).copy()
+    mean = np.broadcast_to(np.array([123.7, 116.8, 103.9], np.float32), (4, 4, 3)).copy()
     net = {"layers": layers, "meta": {"normalization": {"averageImage": mean}}}
     savemat(path, {"net": net})
     return kept | {"scores": scores, "centres": centres, "whitening": whitening, "offset": offset}

@@ -72,17 +72,17 @@ class NetworkDescriptor(Protocol):
         ...
 
 
-def square_input(image_rgb: Image, side_px: int = SIDE_PX) -> torch.Tensor:
+def square_input(image_rgb: Image | None, side_px: int = SIDE_PX) -> torch.Tensor:
     """The image (H, W, 3) as (3, side, side), RGB in [0, 1]; its aspect is lost, as the transformers were trained."""
     return _resized(image_rgb, side_px, side_px)
 
 
-def longest_side_input(image_rgb: Image, side_px: int = SIDE_PX) -> torch.Tensor:
+def longest_side_input(image_rgb: Image | None, side_px: int = SIDE_PX) -> torch.Tensor:
     """The image (H, W, 3) as (3, h, w), RGB in [0, 1], its longest side `side_px` and its aspect kept.
 
     A very long image keeps at least `SMALLEST_SIDE_PX` across.
     """
-    height, width = image_rgb.shape[:2]
+    height, width = check_image(image_rgb).shape[:2]
     scale = side_px / max(height, width)
     return _resized(image_rgb, *(max(SMALLEST_SIDE_PX, round(side * scale)) for side in (height, width)))
 
@@ -124,7 +124,7 @@ def check_repeatable(samples: Iterable[Any]) -> None:
         raise ValueError("expected samples that can be gone through twice, such as a list, got an iterator")
 
 
-def _resized(image_rgb: Image, height: int, width: int) -> torch.Tensor:
+def _resized(image_rgb: Image | None, height: int, width: int) -> torch.Tensor:
     """Bilinear with the triangle as wide as the reduction, and rounded to bytes, as the networks were trained."""
     import torch
 

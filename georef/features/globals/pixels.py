@@ -22,7 +22,7 @@ class PixelDescriptor:
     """Prepares images, runs the network on those of equal size together, and brings rows to unit length.
 
     network: (N, 3, h, w) as `prepare` made them, on the device, to rows (N, size). prepare: an image (H, W, 3) uint8 to
-    (3, h, w) float32 in [0, 1]. weights: entries of the weights table that made the network, for the version.
+    (3, h, w) float32 in [0, 1], or ValueError. weights: entries of the weights table behind it, for the version.
     device: "cpu", "cuda", or "auto".
     """
 
@@ -33,7 +33,7 @@ class PixelDescriptor:
         name: str,
         size: int,
         network: nn.Module,
-        prepare: Callable[[Image], Tensor],
+        prepare: Callable[[Image | None], Tensor],
         weights: Sequence[str],
         device: str = "cpu",
         settings: str = "",
@@ -51,7 +51,7 @@ class PixelDescriptor:
     def describe(self, image_rgb: Image | None, features: Features | None) -> Row:
         """The row (size,) of an image (H, W, 3) uint8 RGB. Raises ValueError for anything else."""
         del features
-        return self._rows([self._prepare(image_rgb)])[0]  # type: ignore[arg-type]  # prepare refuses None
+        return self._rows([self._prepare(image_rgb)])[0]  # which refuses None
 
     def describe_many(self, images_rgb: Sequence[Image]) -> NDArray[np.float32]:
         """Rows (N, size) of images; equal to those one by one but for rounding (1e-5)."""

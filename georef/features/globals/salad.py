@@ -40,7 +40,7 @@ class _SaladNetwork(nn.Module):
     def __init__(self) -> None:
         super().__init__()
         self.backbone = _Backbone()
-        self.aggregator = Salad(cluster_width=128)
+        self.aggregator = Salad(VIT_B14.width, 128)
 
     def forward(self, image: Tensor) -> Tensor:
         return self.aggregator(*self.backbone.model(normalized(image)))
@@ -66,14 +66,14 @@ class _Backbone(nn.Module):
 class _MegaLocAggregator(nn.Module):
     def __init__(self) -> None:
         super().__init__()
-        self.agg = Salad(cluster_width=256)
+        self.agg = Salad(VIT_B14.width, 256)
         self.linear = nn.Linear(_TOKEN + _CLUSTERS * 256, MEGALOC_SIZE)
 
 
 class Salad(nn.Module):
     """Assigns patches to clusters by optimal transport with a bin for what is of no use, and sums them by cluster."""
 
-    def __init__(self, cluster_width: int, width: int = VIT_B14.width) -> None:
+    def __init__(self, width: int, cluster_width: int) -> None:
         super().__init__()
         self.token_features = nn.Sequential(nn.Linear(width, _HIDDEN), nn.ReLU(), nn.Linear(_HIDDEN, _TOKEN))
         self.cluster_features = _two_layers(width, cluster_width)

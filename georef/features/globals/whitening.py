@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import eigh
 
 from georef.features.globals.base import unit_rows
 
@@ -47,7 +48,8 @@ def _principal(centred: NDArray[np.float32], size: int) -> tuple[NDArray[np.floa
     count, dimension = centred.shape
     wide = count <= dimension
     product = (centred @ centred.T if wide else centred.T @ centred).astype(np.float64) / count
-    values, vectors = np.linalg.eigh(product)
+    last = len(product) - 1
+    values, vectors = eigh(product, subset_by_index=(max(0, last - size + 1), last), overwrite_a=True)
     values, vectors = values[::-1], vectors[:, ::-1]
     keep = min(size, count - 1, int(np.count_nonzero(values > 1e-6 * max(values[0], 1e-30))))
     if keep < 1:
