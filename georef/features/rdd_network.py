@@ -30,7 +30,6 @@ from georef.features.folding import fold
 MULTIPLE = 32  # sides that the levels divide
 WIDTH = 256  # channels of the transformer
 _HEADS, _LEVELS, _POINTS = 8, 5, 8  # points that a head looks at in each level
-_LAYERS = 4
 _BLOCKS = (3, 4, 6, 3)  # of ResNet-50
 _QUERIES = 4096  # tokens handled at once: 5.2 million lookups, 0.2 GB
 
@@ -46,6 +45,7 @@ class RddNetwork:
             norm = key.removesuffix(".running_mean")
             folded.update(fold(weights, _conv_before(norm), norm))
         self._weights = {key: tensor.to(device) for key, tensor in folded.items()}
+        self._layers = sum(key.endswith("self_attn.value_proj.weight") for key in weights)  # four, as published
 
     def dense(self, image: Tensor) -> tuple[Tensor, Tensor]:
         """Descriptors of cells of 4 px (1, 256, h, w) and the score map (H, W) of an image (3, H, W), RGB in [0, 1]."""
@@ -81,7 +81,7 @@ class RddNetwork:
         places = torch.cat([_encoding(size, x.device) + row for size, row in zip(sizes, embedding, strict=True)])
         tokens = torch.cat([level[0].flatten(1).T for level in levels])
         centres = torch.cat([_centres(size, x.device) for size in sizes])
-        for layer in range(_LAYERS):
+        for layer in range(self._layers):
             name = f"descriptor.transformer.encoder.layers.{layer}"
             tokens = self._norm(f"{name}.norm1", tokens + self._attend(name, tokens, places, centres, sizes))
             wide = self._linear(f"{name}.linear2", relu(self._linear(f"{name}.linear1", tokens)))

@@ -62,7 +62,8 @@ def superpoint_weights(seed: int = 0) -> dict[str, Tensor]:
     return maker.made
 
 
-def rdd_weights(seed: int = 0) -> dict[str, Tensor]:
+def rdd_weights(seed: int = 0, layers: int = 1) -> dict[str, Tensor]:
+    """With fewer layers than the published four: a quarter of the time."""
     maker = Maker(seed)
     _rdd_detector(maker)
     _resnet50(maker, "descriptor.backbone.0.body")
@@ -70,7 +71,7 @@ def rdd_weights(seed: int = 0) -> dict[str, Tensor]:
         maker.conv(f"descriptor.input_proj.{level}.0", 256, width, 3 if level == 4 else 1, bias=True)
         maker.norm(f"descriptor.input_proj.{level}.1", 256, statistics=False)
     maker.normal("descriptor.transformer.level_embed", 5, 256, scale=1.0)
-    for layer in range(4):
+    for layer in range(layers):
         name = f"descriptor.transformer.encoder.layers.{layer}"
         maker.linear(f"{name}.self_attn.sampling_offsets", 8 * 5 * 8 * 2, 256)
         maker.linear(f"{name}.self_attn.attention_weights", 8 * 5 * 8, 256)

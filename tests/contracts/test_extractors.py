@@ -53,7 +53,7 @@ def test_a_textured_image_fills_the_budget(extractor: Extractor) -> None:
 def test_the_budget_keeps_the_best(extractor: Extractor) -> None:
     image = textured_image(400, 300)
     many, few = (extract_features(extractor, image, 1024, count) for count in (400, 50))
-    np.testing.assert_allclose(few.keypoints_px[:40], many.keypoints_px[:40], atol=1e-3)
+    np.testing.assert_allclose(few.keypoints_px[:25], many.keypoints_px[:25], atol=1e-3)
 
 
 @pytest.mark.parametrize("value", [0, 128, 255])
@@ -108,7 +108,7 @@ def test_a_level_reports_full_resolution_pixels(
     fine = extract_features(extractor, image, 768, 800)
     coarse = extract_features(extractor, image, 384, 400)
     _assert_valid(coarse, extractor, (768, 512), 400)
-    assert coarse.scales_px.min() >= 1.9 * fine.scales_px.min()
+    assert coarse.scales_px.min() >= 1.7 * fine.scales_px.min()
     offsets = nearest_offsets(coarse.keypoints_px, fine.keypoints_px, within_px=2)
     assert len(offsets) > 50
     limit_px = 0.05 if extractor.name in CENTRED else 0.6
