@@ -15,6 +15,7 @@ from georef.types.features import Features, Matches
 __all__ = ["Descriptors", "Detections", "Extractor", "Image", "Matcher", "extract_features"]
 
 SMALLEST_SIDE_PX = 16  # below this a level holds nothing that a detector could localise
+STRUCTURE_RADIUS_PX = 4  # of the window in a level about a keypoint that must show something
 _BUDGETS = ((1024, 4096), (2048, 6144))  # keypoints of levels whose longest side is at most so many pixels
 _BUDGET_PER_MEGAPIXEL = 1024  # of larger levels
 
@@ -81,7 +82,8 @@ def extract_features(
     if min(size) < SMALLEST_SIDE_PX or budget <= 0:
         return empty_features(extractor, image_size)
     level = resize_image(image_rgb, size)
-    return _to_full_resolution(_detect(extractor, level, budget), level, image_size).head(budget)
+    found = _with_structure(_detect(extractor, level, budget), level)
+    return _to_full_resolution(found, level, image_size).head(budget)
 
 
 def level_budget(size: tuple[int, int]) -> int:
@@ -111,6 +113,17 @@ def resize_image(image_rgb: Image, size: tuple[int, int]) -> Image:
     if size == (image_rgb.shape[1], image_rgb.shape[0]):
         return np.ascontiguousarray(image_rgb)
     return np.asarray(cv2.resize(image_rgb, size, interpolation=cv2.INTER_AREA), np.uint8)
+
+
+def _with_structure(found: Detections, level: Image) -> Detections:
+    """Detections about which the level is not all of one colour; networks find some in saturated sky and blank frames,
+    near borders above all."""
+    size = np.array([level.shape[1], level.shape[0]])
+    side = np.arange(-STRUCTURE_RADIUS_PX, STRUCTURE_RADIUS_PX + 1)
+    window = np.stack(np.meshgrid(side, side), -1).reshape(-1, 2)
+    around = np.clip(found.keypoints_px.astype(np.int64)[:, None] + window, 0, size - 1)
+    colours = level[around[..., 1], around[..., 0]]  # (N, window, 3)
+    return found.take(np.flatnonzero((colours != colours[:, :1]).any((1, 2))))
 
 
 def _to_full_resolution(found: Detections, level: Image, image_size: tuple[int, int]) -> Features:

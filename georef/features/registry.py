@@ -52,6 +52,8 @@ EXTRACTORS = ComponentTable(
         "aliked-n32": "georef.features.aliked:AlikedN32",
         "disk": "georef.features.disk:Disk",
         "xfeat": "georef.features.xfeat:XFeat",
+        "superpoint": "georef.features.superpoint:SuperPoint",
+        "rdd": "georef.features.rdd:Rdd",
     },
 )
 
@@ -63,6 +65,8 @@ MATCHERS = ComponentTable(
         "lightglue-aliked": "georef.features.lightglue:LightGlueAliked",
         "lightglue-disk": "georef.features.lightglue:LightGlueDisk",
         "lighterglue-xfeat": "georef.features.lightglue:LighterGlue",
+        "lightglue-superpoint": "georef.features.lightglue:LightGlueSuperPoint",
+        "lightglue-rdd": "georef.features.lightglue:LightGlueRdd",
     },
 )
 

@@ -9,9 +9,10 @@ import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, conv2d, grid_sample, interpolate, normalize, pad, pixel_shuffle, relu
 
+from georef.features.folding import EPSILON, fold
+
 MULTIPLE = 32  # sides that the levels divide
 CELL = 8  # pixels; one descriptor and 64 scores each
-_EPSILON = 1e-5
 _BLOCKS = {  # strides of the layers of each block
     "block1": (1, 2, 1, 2),
     "block2": (1, 1),
@@ -41,7 +42,7 @@ class XFeatNetwork:
         height, width = image.shape[1:]
         grey = image.mean(0, keepdim=True)[None]
         variance, mean = torch.var_mean(grey, correction=0)
-        grey = (grey - mean) * (variance + _EPSILON).rsqrt()
+        grey = (grey - mean) * (variance + EPSILON).rsqrt()
         x = pad(grey, (0, -width % MULTIPLE, 0, -height % MULTIPLE), mode="replicate")
         cells = self._features(x)
         reliability = torch.sigmoid(self._conv("heatmap_head.2", self._block("heatmap_head", cells)))
@@ -79,11 +80,9 @@ def sample_cells(cells: Tensor, pixels: Tensor, mode: str) -> Tensor:
 
 
 def _folded(weights: dict[str, Tensor]) -> dict[str, Tensor]:
-    """The weights with each batch normalisation, which has neither scale nor shift, made part of its convolution."""
+    """The weights with each batch normalisation made part of its convolution; without the semi-dense matcher's."""
     folded = {key: tensor for key, tensor in weights.items() if ".layer." not in key and "fine_matcher" not in key}
     for key in (key for key in weights if key.endswith(".layer.1.running_var")):
         layer = key.removesuffix(".1.running_var")
-        factor = (weights[key] + _EPSILON).rsqrt()
-        folded[f"{layer}.0.weight"] = weights[f"{layer}.0.weight"] * factor[:, None, None, None]
-        folded[f"{layer}.0.bias"] = -weights[f"{layer}.1.running_mean"] * factor
+        folded.update(fold(weights, f"{layer}.0", f"{layer}.1"))
     return folded

@@ -13,8 +13,8 @@ def textured_image(width: int, height: int, seed: int = 0) -> Image:
     """An RGB image (height, width, 3) of turned rectangles with a little noise: edges, corners, plain areas."""
     rng = np.random.default_rng(seed)
     image = np.full((height, width, 3), 128, np.uint8)
-    for _ in range(max(8, width * height // 1500)):
-        centre, size = rng.uniform((0, 0), (width, height)), rng.uniform(6, 60, 2)
+    for _ in range(max(8, width * height // 300)):
+        centre, size = rng.uniform((0, 0), (width, height)), rng.uniform(3, 60, 2) * rng.uniform(0.3, 1)
         box = cv2.boxPoints((tuple(map(float, centre)), tuple(map(float, size)), float(rng.uniform(0, 180))))
         cv2.fillPoly(image, [box.astype(np.int32)], tuple(map(int, rng.integers(20, 236, 3))), lineType=cv2.LINE_AA)
     smooth = cv2.GaussianBlur(image, (0, 0), 0.8)

@@ -2,33 +2,48 @@
 
 from __future__ import annotations
 
-from functools import lru_cache
+from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import pytest
+from made_weights import MADE
+from synthetic import textured_image
 
-from georef.errors import WeightsError
-from georef.features.base import Matcher
-from georef.features.registry import MATCHERS, load_component
+from georef.features.base import Matcher, extract_features
+from georef.features.registry import EXTRACTORS, MATCHERS, ComponentTable
 from georef.types.features import Features, Matches
 
-
-@lru_cache
-def _load(name: str) -> Matcher:
-    return load_component(MATCHERS, name)
+Component = Callable[[ComponentTable, str], Any]
+Of = Callable[..., Features]
 
 
 @pytest.fixture(params=MATCHERS.names())
-def matcher(request: pytest.FixtureRequest) -> Matcher:
-    try:
-        return _load(request.param)
-    except WeightsError as error:
-        pytest.skip(f"weights of {request.param} are not in the cache: {str(error).splitlines()[0]}")
+def matcher(request: pytest.FixtureRequest, component: Component) -> Matcher:
+    return component(MATCHERS, request.param)
 
 
-def _random_features(count: int, seed: int = 0) -> Features:
+@pytest.fixture
+def features_of(matcher: Matcher, component: Component) -> Of:
+    """Makes features that the matcher fits: real ones of its extractor, random ones for a matcher that fits all."""
+    fitting = getattr(matcher, "extractors", None)
+
+    def make(count: int, seed: int = 0) -> Features:
+        if fitting is None:
+            return _random_features(count, 128, seed)
+        size = EXTRACTORS.resolve(fitting[0]).load().descriptor_size
+        if getattr(matcher, "weights", None) in MADE:
+            return _random_features(count, size, seed)
+        found = extract_features(component(EXTRACTORS, fitting[0]), textured_image(640, 480, seed), 640, 300)
+        assert len(found) >= count
+        return found.head(count)
+
+    return make
+
+
+def _random_features(count: int, size: int, seed: int) -> Features:
     rng = np.random.default_rng(seed)
-    descriptors = rng.normal(size=(count, 128))
+    descriptors = rng.normal(size=(count, size))
     descriptors /= np.linalg.norm(descriptors, axis=1, keepdims=True)
     return Features(
         image_size=(640, 480),
@@ -52,48 +67,57 @@ def _assert_valid(matches: Matches, count_a: int, count_b: int) -> None:
 
 
 @pytest.mark.parametrize(("count_a", "count_b"), [(0, 0), (0, 5), (5, 0)])
-def test_nothing_matches_nothing(matcher: Matcher, count_a: int, count_b: int) -> None:
-    matches = matcher.match(_random_features(count_a), _random_features(count_b))
+def test_nothing_matches_nothing(matcher: Matcher, features_of: Of, count_a: int, count_b: int) -> None:
+    matches = matcher.match(features_of(count_a), features_of(count_b))
     _assert_valid(matches, count_a, count_b)
     assert len(matches) == 0
 
 
 @pytest.mark.parametrize(("count_a", "count_b"), [(1, 1), (1, 30), (30, 1), (2, 2)])
-def test_few_keypoints(matcher: Matcher, count_a: int, count_b: int) -> None:
-    matches = matcher.match(_random_features(count_a), _random_features(count_b, seed=1))
+def test_few_keypoints(matcher: Matcher, features_of: Of, count_a: int, count_b: int) -> None:
+    matches = matcher.match(features_of(count_a), features_of(count_b, seed=1))
     _assert_valid(matches, count_a, count_b)
 
 
-def test_one_keypoint_matches_itself(matcher: Matcher) -> None:
-    one = _random_features(1)
+def test_one_keypoint_matches_itself(
+    matcher: Matcher, features_of: Of, with_trained_weights: Callable[[Any], None]
+) -> None:
+    with_trained_weights(matcher)
+    one = features_of(1)
     assert matcher.match(one, one).indices.tolist() == [[0, 0]]
 
 
-def test_identical_features_match_to_themselves(matcher: Matcher) -> None:
-    features = _random_features(300)
+def test_identical_features_match_to_themselves(
+    matcher: Matcher, features_of: Of, with_trained_weights: Callable[[Any], None]
+) -> None:
+    with_trained_weights(matcher)
+    features = features_of(300)
     matches = matcher.match(features, features)
     _assert_valid(matches, 300, 300)
     assert len(matches) >= 285
     np.testing.assert_array_equal(matches.indices[:, 0], matches.indices[:, 1])
 
 
-def test_a_shuffled_copy_is_matched_back(matcher: Matcher) -> None:
-    features = _random_features(200)
+def test_a_shuffled_copy_is_matched_back(
+    matcher: Matcher, features_of: Of, with_trained_weights: Callable[[Any], None]
+) -> None:
+    with_trained_weights(matcher)
+    features = features_of(200)
     order = np.random.default_rng(1).permutation(200)
     matches = matcher.match(features, features.take(order))
     assert len(matches) >= 190
     np.testing.assert_array_equal(order[matches.indices[:, 1]], matches.indices[:, 0])
 
 
-def test_each_index_at_most_once(matcher: Matcher) -> None:
-    features = _random_features(120)
+def test_each_index_at_most_once(matcher: Matcher, features_of: Of) -> None:
+    features = features_of(120)
     doubled = features.take(np.repeat(np.arange(60), 2))
     _assert_valid(matcher.match(features, doubled), 120, 120)
     _assert_valid(matcher.match(doubled, features), 120, 120)
 
 
-def test_twice_the_same(matcher: Matcher) -> None:
-    a, b = _random_features(150), _random_features(170)
+def test_twice_the_same(matcher: Matcher, features_of: Of) -> None:
+    a, b = features_of(150), features_of(170)
     first, second = matcher.match(a, b), matcher.match(a, b)
     np.testing.assert_array_equal(first.indices, second.indices)
     np.testing.assert_array_equal(first.scores, second.scores)
