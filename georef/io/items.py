@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import zipfile
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote, unquote
@@ -12,6 +13,7 @@ from urllib.parse import quote, unquote
 import numpy as np
 
 from georef.errors import StageError
+from georef.geometry.camera import Camera
 from georef.geometry.rigid import Rigid3
 from georef.io.files import write_bytes_atomically
 from georef.types.results import Localized, Outcome, ReferenceMatches, Rejected, RejectReason
@@ -67,6 +69,7 @@ def write_outcome(path: Path, outcome: Outcome) -> None:
         "gnss_offset_m": outcome.gnss_offset_m,
         "notes": outcome.notes,
         "cpu_s": outcome.cpu_s,
+        "camera": None if outcome.camera is None else asdict(outcome.camera),
     }
     arrays = {
         "world_from_cam": outcome.world_from_cam.matrix(),
@@ -75,6 +78,8 @@ def write_outcome(path: Path, outcome: Outcome) -> None:
         "points": outcome.points_in_world,
         "keypoints": outcome.keypoints,
     }
+    if outcome.intrinsics_cov is not None:
+        arrays["intrinsics_cov"] = outcome.intrinsics_cov
     write_item(path, header, arrays | {f"matches_{i}": m.indices for i, m in enumerate(outcome.matches)})
 
 
@@ -99,4 +104,13 @@ def read_outcome(path: Path) -> Outcome:
         gnss_offset_m=header["gnss_offset_m"],
         notes=notes,
         cpu_s=header["cpu_s"],
+        camera=_camera(header.get("camera")),
+        intrinsics_cov=arrays.get("intrinsics_cov"),
     )
+
+
+def _camera(stored: dict[str, Any] | None) -> Camera | None:
+    if stored is None:
+        return None
+    lists = {"distortion": tuple(stored["distortion"]), "estimate": tuple(stored["estimate"])}
+    return Camera(**{**stored, **lists})
