@@ -110,11 +110,17 @@ def epoch_problem(
     control: tuple[ControlPoint, ...],
     config: AdjustConfig,
 ) -> Problem:
-    """The problem of the localized images (all four sequences in one order) for the configured constraints."""
-    posed, matches, covs = list(new), list(ties) if config.tie_points else [], [r.world_from_cam_cov for r in localized]
+    """The problem of the localized images (all four sequences in one order) for the configured constraints.
+
+    An image whose camera was estimated keeps its localization: it takes part by its pose with the covariance that is
+    marginal to its camera, and by no keypoint, which the same matches would count twice and a held camera too much.
+    """
+    known = [not p.camera.estimate for p in new]
+    ties = [m for m in ties if known[m.a] and known[m.b]] if config.tie_points else []
+    posed, matches, covs = list(new), ties, [r.world_from_cam_cov for r in localized]
     used: list[int] = []
-    if config.constraints == "auto-gcps":
-        used, to_references = _reference_matches(localized, reference, len(new))
+    if config.constraints == "auto-gcps" and any(known):
+        used, to_references = _reference_matches(localized, known, reference)
         posed += [reference.posed(i) for i in used]
         covs += [reference.pose_cov(i) for i in used]
         matches += to_references
@@ -127,9 +133,11 @@ def epoch_problem(
         points=points,
         observations=observations.take(in_new),
         gcps=_automatic_gcps(observations.take(~in_new), len(points), len(new), used, reference),
-        pose_priors=_pose_priors(localized) if config.constraints == "pose-priors" else {},
+        pose_priors=_pose_priors(localized, known, of_all=config.constraints == "pose-priors"),
         position_priors=_position_priors(images, localized) if config.gnss else {},
-        control=control if config.surveyed_control else (),
+        control=_marked_in(control, [i.image_id for i, k in zip(images, known, strict=True) if k])
+        if config.surveyed_control
+        else (),
     )
     return problem.restricted(np.ones(len(problem.observations), bool), np.ones(len(problem.gcps), bool))
 
@@ -188,16 +196,15 @@ def _automatic_gcps(
 
 
 def _reference_matches(
-    localized: Sequence[Localized], reference: ReferenceMap, new_count: int
+    localized: Sequence[Localized], known: Sequence[bool], reference: ReferenceMap
 ) -> tuple[list[int], list[PairMatches]]:
-    """The references that the localizations rest on, and their verified matches with the new images."""
+    """The references that localizations with a known camera rest on, and their verified matches with the new images."""
     index = {image.image_id: i for i, image in enumerate(reference.images)}
-    used = sorted({index[m.reference_id] for result in localized for m in result.matches})
-    place = {i: new_count + k for k, i in enumerate(used)}
+    taking_part = [(n, result) for n, result in enumerate(localized) if known[n]]
+    used = sorted({index[m.reference_id] for _, result in taking_part for m in result.matches})
+    place = {i: len(localized) + k for k, i in enumerate(used)}
     matches = [
-        PairMatches(n, place[index[m.reference_id]], m.indices)
-        for n, result in enumerate(localized)
-        for m in result.matches
+        PairMatches(n, place[index[m.reference_id]], m.indices) for n, result in taking_part for m in result.matches
     ]
     if not matches:
         raise StageError(
@@ -206,8 +213,15 @@ def _reference_matches(
     return used, matches
 
 
-def _pose_priors(localized: Sequence[Localized]) -> Mapping[int, PosePrior]:
-    return {i: PosePrior(r.world_from_cam, r.world_from_cam_cov) for i, r in enumerate(localized)}
+def _pose_priors(localized: Sequence[Localized], known: Sequence[bool], *, of_all: bool) -> Mapping[int, PosePrior]:
+    return {
+        i: PosePrior(r.world_from_cam, r.world_from_cam_cov) for i, r in enumerate(localized) if of_all or not known[i]
+    }
+
+
+def _marked_in(control: tuple[ControlPoint, ...], image_ids: Sequence[str]) -> tuple[ControlPoint, ...]:
+    """The control points with their marks in some images."""
+    return tuple(replace(p, marks=tuple(m for m in p.marks if m.image_id in image_ids)) for p in control)
 
 
 def _position_priors(images: Sequence[Image], localized: Sequence[Localized]):

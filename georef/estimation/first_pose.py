@@ -50,10 +50,15 @@ class FirstPose:
 def ransac_pose(query: QueryImage, model: LocalModel, gate_px: float, seed: int) -> FirstPose | None:
     """Pose by COLMAP's LO-RANSAC (P3P, EPnP; P4PF) and its refinement; None without consensus."""
     pixels = query.pixels[model.keypoint]
-    if "focal" not in query.camera.estimate:
+    if not query.camera.estimate:
         return _with_known_focal(query.camera, pixels, model, gate_px, seed)
-    guess = _guesses_of_fisheye if query.camera.model == "fisheye" else _guesses_of_focal
-    found = list(guess(query.camera, pixels, model, gate_px, seed))
+    unknown_focal = "focal" in query.camera.estimate
+    if unknown_focal and query.camera.model != "fisheye":
+        found = list(_guesses_of_focal(query.camera, pixels, model, gate_px, seed))
+    else:
+        guesses = _fisheyes(query.camera) if unknown_focal else _distortions(query.camera)
+        tried = [_with_known_focal(camera, pixels, model, gate_px, seed) for camera in guesses]
+        found = [first for first in tried if first is not None]
     # A wide gate lets a wrong guess pass: of equal counts the one that fits better.
     return max(found, key=lambda first: _score(first, pixels, model, gate_px), default=None)
 
@@ -93,12 +98,11 @@ def _guesses_of_focal(
 ) -> Iterator[FirstPose]:
     """Poses with an estimated focal length, one for each guess of the distortion."""
     centre = np.array([camera.cx, camera.cy])
-    half_diagonal = 0.5 * float(np.hypot(camera.width, camera.height))
     for division in _DIVISIONS if "k1" in camera.estimate else (None,):
         ideal = ideal_from_observed(camera, pixels)
         if division is not None:
             offset = pixels - centre
-            square = np.square(offset).sum(axis=1, keepdims=True) / half_diagonal**2
+            square = np.square(offset).sum(axis=1, keepdims=True) / _half_diagonal(camera) ** 2
             ideal = centre + offset / (1.0 + division * square)
         pinhole = Camera(camera.camera_id, camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
         found = _with_focal(pinhole, ideal, model, gate_px, seed)
@@ -107,8 +111,7 @@ def _guesses_of_focal(
         factor = found.camera.fx / camera.fx
         start = camera.changed(("focal",), [np.log(factor)])
         if division is not None:
-            k1 = division * (start.fx / half_diagonal) ** 2
-            start = start.changed(("k1",), [k1 - start.value("k1")])
+            start = _with_division(start, division)
         yield replace(found, camera=start)
 
 
@@ -133,13 +136,26 @@ def _with_focal(pinhole: Camera, pixels: Array, model: LocalModel, gate_px: floa
     return FirstPose(_world_from_cam(found, origin), inliers, pinhole.changed(("focal",), [np.log(factor)]))
 
 
-def _guesses_of_fisheye(
-    camera: Camera, pixels: Array, model: LocalModel, gate_px: float, seed: int
-) -> Iterator[FirstPose]:
-    for factor in _FOCAL_FACTORS:
-        found = _with_known_focal(camera.changed(("focal",), [np.log(factor)]), pixels, model, gate_px, seed)
-        if found is not None:
-            yield found
+def _fisheyes(camera: Camera) -> list[Camera]:
+    """The camera with several focal lengths."""
+    return [camera.changed(("focal",), [np.log(factor)]) for factor in _FOCAL_FACTORS]
+
+
+def _distortions(camera: Camera) -> list[Camera]:
+    """The camera with several k1; a fisheye as it is, whose k1 is small."""
+    if camera.model == "fisheye":
+        return [camera]
+    return [_with_division(camera, division) for division in _DIVISIONS]
+
+
+def _with_division(camera: Camera, division: float) -> Camera:
+    """The camera with the k1 that a distortion of the division model amounts to at its focal length."""
+    k1 = division * (camera.fx / _half_diagonal(camera)) ** 2
+    return camera.changed(("k1",), [k1 - camera.value("k1")])
+
+
+def _half_diagonal(camera: Camera) -> float:
+    return 0.5 * float(np.hypot(camera.width, camera.height))
 
 
 def _score(first: FirstPose, pixels: Array, model: LocalModel, gate_px: float) -> float:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import zipfile
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote, unquote
@@ -12,6 +13,7 @@ from urllib.parse import quote, unquote
 import numpy as np
 
 from georef.errors import StageError
+from georef.geometry.camera import Camera
 from georef.geometry.rigid import Rigid3
 from georef.io.files import write_bytes_atomically
 from georef.types.results import Localized, Outcome, ReferenceMatches, Rejected, RejectReason
@@ -66,6 +68,7 @@ def write_outcome(path: Path, outcome: Outcome) -> None:
         "gnss_rejected": outcome.gnss_rejected,
         "gnss_offset_m": outcome.gnss_offset_m,
         **_told(outcome),
+        "camera": None if outcome.camera is None else asdict(outcome.camera),
     }
     arrays = {
         "world_from_cam": outcome.world_from_cam.matrix(),
@@ -74,6 +77,8 @@ def write_outcome(path: Path, outcome: Outcome) -> None:
         "points": outcome.points_in_world,
         "keypoints": outcome.keypoints,
     }
+    if outcome.intrinsics_cov is not None:
+        arrays["intrinsics_cov"] = outcome.intrinsics_cov
     write_item(path, header, arrays | {f"matches_{i}": m.indices for i, m in enumerate(outcome.matches)})
 
 
@@ -101,9 +106,18 @@ def read_outcome(path: Path) -> Outcome:
         gnss_rejected=header["gnss_rejected"],
         gnss_offset_m=header["gnss_offset_m"],
         **told,
+        camera=_camera(header.get("camera")),
+        intrinsics_cov=arrays.get("intrinsics_cov"),
     )
 
 
 def _told(outcome: Outcome) -> dict[str, Any]:
     """What both kinds of outcome say of how they came about."""
     return {"notes": outcome.notes, "cpu_s": outcome.cpu_s, "candidates": outcome.candidates}
+
+
+def _camera(stored: dict[str, Any] | None) -> Camera | None:
+    if stored is None:
+        return None
+    lists = {"distortion": tuple(stored["distortion"]), "estimate": tuple(stored["estimate"])}
+    return Camera(**{**stored, **lists})

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -44,6 +45,7 @@ class PoseRecord:
     cov: Array | None = None  # (6, 6)
     position_sigmas_m: Array | None = None  # (3,) along the axes of the CRS
     angle_sigmas_deg: Array | None = None  # (3,) omega, phi, kappa
+    intrinsics: Mapping[str, tuple[float, float]] = field(default_factory=dict)  # estimated with the pose: value, sigma
 
     def __post_init__(self) -> None:
         rejected = is_rejected(self.status)

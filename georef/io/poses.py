@@ -4,18 +4,20 @@
     # Covariance: cov_ij, upper triangle, of xi in T Exp(xi), T = world_from_cam; xi = rotation (rad), then ...
     image,easting,northing,height,omega,phi,kappa,status,cov_00..cov_55,sigma_e,...,sigma_kappa,angles_singular
 
-Positions go to 0.1 mm, angles to 1e-6 deg. An image without a pose has a row with its status and empty numbers.
+Positions go to 0.1 mm, angles to 1e-6 deg. An image without a pose has a row with its status and empty numbers. Where
+something of a camera was estimated with the pose, columns at the end have it: focal (fx, px), sigma_focal, k1 ...
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 
 from georef.geometry.angles import omega_phi_kappa_from_rotation
+from georef.geometry.camera import ESTIMABLE
 from georef.geometry.covariance import COV_COLUMNS, from_upper_triangle, upper_triangle
 from georef.geometry.rigid import Array
 from georef.io.columns import POSITION_COLUMNS, SIGMA_COLUMNS, CrsKind
@@ -48,8 +50,9 @@ def write_poses(records: Iterable[PoseRecord], path: Path | str, frame: PosesFra
     if len({record.image_id for record in records}) != len(records):
         raise ValueError("an image has two poses")
     lines = [f"# {_one_line(comment)}" for comment in _comments(frame)]
-    lines.append(",".join(_header(frame.crs_kind)))
-    lines += [",".join(_cells(record, frame.crs_kind)) for record in records]
+    estimated = [name for name in ESTIMABLE if any(name in record.intrinsics for record in records)]
+    lines.append(",".join([*_header(frame.crs_kind), *(c for n in estimated for c in (n, f"sigma_{n}"))]))
+    lines += [",".join([*_cells(r, frame.crs_kind), *_intrinsics(r, estimated)]) for r in records]
     write_text_atomically("\n".join(lines) + "\n", path)
 
 
@@ -113,6 +116,14 @@ def _cells(record: PoseRecord, kind: CrsKind) -> list[str]:
         *_optional(position_sigmas, 3, ".6g"),
         *_optional(None if record.angles_singular else angle_sigmas, 3, ".6g"),
         str(int(record.angles_singular)),
+    ]
+
+
+def _intrinsics(record: PoseRecord, names: Sequence[str]) -> list[str]:
+    return [
+        cell
+        for name in names
+        for cell in ([format(v, ".9g") for v in record.intrinsics[name]] if name in record.intrinsics else ["", ""])
     ]
 
 

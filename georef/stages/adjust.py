@@ -19,7 +19,7 @@ from georef.geometry.rigid import Array, Rigid3
 from georef.io.items import read_item, write_item
 from georef.stages.base import StageContext, StageSummary, feature_id, open_features
 from georef.stages.localize import make_task, read_outcomes
-from georef.types.results import Localized
+from georef.types.results import Localized, with_estimated_cameras
 
 RESULT = "adjusted.npz"
 
@@ -50,8 +50,9 @@ class AdjustedEpoch:
 
 def run(context: StageContext) -> StageSummary:
     """Adjusts the localized images of the epoch."""
-    epoch, config = context.survey.epoch, context.config
-    localized = [o for o in read_outcomes(context.before["localize"], epoch) if isinstance(o, Localized)]
+    config, outcomes = context.config, read_outcomes(context.before["localize"], context.survey.epoch)
+    epoch = with_estimated_cameras(context.survey.epoch, outcomes)
+    localized = [o for o in outcomes if isinstance(o, Localized)]
     if not localized:
         write_item(context.folder / RESULT, {"image_ids": [], "data": {}}, _arrays(None, np.zeros((0, 3), np.uint8)))
         return StageSummary("no image was localized; nothing to adjust")

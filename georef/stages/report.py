@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +27,7 @@ from georef.stages.localize import read_outcomes
 from georef.stages.network import RESULT as NETWORK_RESULT
 from georef.stages.survey import Survey
 from georef.types.constraints import CheckKind
-from georef.types.results import Localized, Outcome, Rejected
+from georef.types.results import Localized, Outcome, Rejected, with_estimated_cameras
 from georef.viewer.scene import Scene
 
 POSES, LOCALIZATION, REPORT, HTML, RECORDING = (
@@ -40,8 +41,10 @@ POSES, LOCALIZATION, REPORT, HTML, RECORDING = (
 
 def run(context: StageContext) -> StageSummary:
     """Publishes the epoch: poses before and after the adjustment, the report, the recording."""
-    survey, folder = context.survey, context.project.published(context.epoch)
-    outcomes = read_outcomes(context.before["localize"], survey.epoch)
+    folder = context.project.published(context.epoch)
+    outcomes = read_outcomes(context.before["localize"], context.survey.epoch)
+    survey = replace(context.survey, epoch=with_estimated_cameras(context.survey.epoch, outcomes))
+    context = replace(context, survey=survey)
     adjusted = read_adjusted(context.before["adjust"])
     frame = poses_frame(survey)
     write_poses(_localized_records(outcomes, survey), folder / LOCALIZATION, frame)
@@ -105,6 +108,7 @@ def _localized_records(outcomes: Sequence[Outcome], survey: Survey) -> list[Pose
         [o.world_from_cam_cov for o in localized],
         survey,
     )
+    records = {o.image_id: replace(records[o.image_id], intrinsics=o.intrinsic_sigmas) for o in localized}
     return [records.get(o.image_id) or _rejected(o) for o in outcomes]
 
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections.abc import Iterable
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
 
 import numpy as np
@@ -11,6 +12,7 @@ from numpy.typing import NDArray
 from georef.geometry.camera import Camera
 from georef.geometry.covariance import pose_cov_from_parts
 from georef.geometry.rigid import Array, Rigid3
+from georef.types.campaign import Campaign
 
 
 class RejectReason(StrEnum):
@@ -80,6 +82,15 @@ class Rejected:
 
 
 Outcome = Localized | Rejected
+
+
+def with_estimated_cameras(campaign: Campaign, outcomes: Iterable[Outcome]) -> Campaign:
+    """The campaign with the cameras that localization has estimated; they still name what was not known of them."""
+    cameras = {o.image_id: o.camera for o in outcomes if isinstance(o, Localized) and o.camera is not None}
+    if not cameras:
+        return campaign
+    images = (replace(i, camera=cameras[i.image_id]) if i.image_id in cameras else i for i in campaign.images)
+    return Campaign(campaign.epoch, tuple(images))
 
 
 @dataclass(frozen=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -199,3 +200,14 @@ def test_plain_exterior_orientation(name: str, kind: str, count: int) -> None:
     assert len(table.records) == count
     assert {record.status for record in table.records} == {"given"}
     assert all(record.has_pose and record.cov is None for record in table.records)
+
+
+def test_what_was_estimated_of_a_camera_has_columns_at_the_end(tmp_path: Path) -> None:
+    rng = np.random.default_rng(8)
+    calibrated, unknown = record_of(rng, "a.jpg"), record_of(rng, "b.jpg")
+    unknown = replace(unknown, intrinsics={"focal": (2761.25, 1.5), "k1": (-0.1, 2e-3)})
+    write_poses([calibrated, unknown, PoseRecord("c.jpg", "rejected: unreadable")], tmp_path / "poses.csv", FRAME)
+    header, *rows = [line.split(",") for line in (tmp_path / "poses.csv").read_text().splitlines() if line[0] != "#"]
+    assert header[-5:] == ["angles_singular", "focal", "sigma_focal", "k1", "sigma_k1"]
+    assert [row[-4:] for row in rows] == [[""] * 4, ["2761.25", "1.5", "-0.1", "0.002"], [""] * 4]
+    assert len(read_poses(tmp_path / "poses.csv").records) == 3

@@ -29,9 +29,9 @@ def marginals(problem: Problem, solution: Solution) -> gtsam.Marginals:
     for first, obs in ((images, problem.observations), (images + points, control_observations(problem))):
         for point, view, pixel, sigma in zip(obs.point, obs.view, obs.pixel, obs.sigma_px, strict=True):
             camera = problem.cameras[view]
-            lens = gtsam.Cal3_S2(camera.fx, camera.fy, 0.0, camera.cx, camera.cy)
+            lens = gtsam.Cal3DS2(camera.fx, camera.fy, 0.0, camera.cx, camera.cy, *camera.distortion)
             noise = gtsam.noiseModel.Isotropic.Sigma(2, sigma)
-            graph.add(gtsam.GenericProjectionFactorCal3_S2(pixel, noise, int(view), int(first + point), lens))
+            graph.add(gtsam.GenericProjectionFactorCal3DS2(pixel, noise, int(view), int(first + point), lens))
     full = gtsam.noiseModel.Gaussian.Covariance
     gcps = problem.gcps
     for point, position, cov in zip(gcps.point, gcps.position, gcps.cov, strict=True):

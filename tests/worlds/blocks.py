@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from dataclasses import dataclass, replace
 from itertools import combinations
 
@@ -13,7 +13,7 @@ from georef.estimation.adjustment.problem import AutomaticGcps, Orientation, Pro
 from georef.estimation.adjustment.solve import Solution
 from georef.estimation.epoch_problem import epoch_problem
 from georef.estimation.tracks import PairMatches
-from georef.geometry.camera import project
+from georef.geometry.camera import Camera, project
 from georef.geometry.rigid import Array, Rigid3
 from georef.types.campaign import PosePrior, PositionPrior
 from georef.types.constraints import ControlPoint, Mark
@@ -57,15 +57,25 @@ def block(
     queries: int = 4,
     blunders: float = 0.0,
     config: AdjustConfig = AUTO_GCPS,
+    camera: Camera = CAMERA,
+    make: Callable[..., World] = court,
+    unknown: Collection[int] = (),
 ) -> Block:
-    """New images with automatic GCPs from references whose poses have errors, by the route of the pipeline."""
+    """New images with automatic GCPs from references whose poses have errors, by the route of the pipeline.
+
+    unknown: new images whose camera was estimated; their pose is given to 5 cm and 3 mrad, as that of all.
+    """
     rng = np.random.default_rng([seed, 77])
-    world = court(seed, points=points, references=references, queries=queries)
+    world = make(seed, points=points, references=references, queries=queries)
     given = [disturbed(pose, noise, rng) for pose in world.references]
-    seen = [photograph(world, pose, rng, keypoint_sigma=noise.keypoint_sigma) for pose in world.references]
-    new = [
-        photograph(world, pose, rng, keypoint_sigma=noise.keypoint_sigma, blunders=blunders) for pose in world.queries
+    seen = [
+        photograph(world, pose, rng, keypoint_sigma=noise.keypoint_sigma, camera=camera) for pose in world.references
     ]
+    new = [
+        photograph(world, pose, rng, keypoint_sigma=noise.keypoint_sigma, blunders=blunders, camera=camera)
+        for pose in world.queries
+    ]
+    new = [replace(n, camera=replace(camera, estimate=("focal",))) if i in unknown else n for i, n in enumerate(new)]
     localized = []
     for i, image in enumerate(new):
         cov = loose_cov(image.truth, 0.05, 0.003)

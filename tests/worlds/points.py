@@ -39,9 +39,10 @@ class Seen:
     features: Features
     point: NDArray[np.int64]  # (N,)
     blunder: NDArray[np.bool_]  # (N,)
+    camera: Camera = CAMERA
 
     def posed(self, world_from_cam: Rigid3 | None = None) -> PosedFeatures:
-        return PosedFeatures.of(self.features, CAMERA, world_from_cam or self.truth)
+        return PosedFeatures.of(self.features, self.camera, world_from_cam or self.truth)
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,6 +71,32 @@ def court(
     )
 
 
+def hall(seed: int, *, points: int = 300, references: int = 6, queries: int = 4) -> World:
+    """A hall whose walls, floor and ceiling stand on all sides of its cameras: for lenses that see to the side."""
+    rng = np.random.default_rng(seed)
+    half = np.array([9.0, 9.0, 4.0])
+    face, position = rng.integers(0, 6, points), rng.uniform(-half, half, (points, 3))
+    axis = face % 3
+    position[np.arange(points), axis] = np.where(face < 3, -1, 1) * half[axis] + rng.uniform(-0.4, 0.4, points)
+    descriptors = unit(rng.normal(size=(points, _DIMENSION)))
+    middle = (0.0, 0.0, -1.6)
+    return World(
+        position,
+        descriptors,
+        _row(rng, references, half_width=3.0, y=(-1.0, 1.0), origin=middle),
+        _row(rng, queries, half_width=2.0, y=(0.5, 2.0), origin=middle),
+    )
+
+
+def flat_wall(seed: int, *, points: int = 300, references: int = 6) -> World:
+    """A wall without relief, and a query that looks at it square on: focal length and distance look alike."""
+    rng = np.random.default_rng(seed)
+    position = np.column_stack([rng.uniform(-8, 8, points), np.full(points, 14.0), rng.uniform(-2, 6, points)])
+    query = Rigid3(_LEVEL_NORTH, np.array([0.3, 2.0, 2.0]))
+    rows = _row(rng, references, half_width=6.0, y=(-1.0, 1.0), origin=(0.0, 0.0, 0.0))
+    return World(position, unit(rng.normal(size=(points, _DIMENSION))), rows, (query,))
+
+
 def _row(
     rng: np.random.Generator, count: int, *, half_width: float, y: tuple[float, float], origin: Sequence[float]
 ) -> tuple[Rigid3, ...]:
@@ -95,10 +122,11 @@ def photograph(
     blunders: float = 0.0,
     clutter: int = 0,
     detected: float = 0.85,
+    camera: Camera = CAMERA,
 ) -> Seen:
     """What a camera at a pose sees: keypoint noise of keypoint_sigma times scale, a share of blunders, clutter."""
-    pixel = project(CAMERA, pose.inverse().apply(world.points))
-    size = np.array([CAMERA.width, CAMERA.height])
+    pixel = project(camera, pose.inverse().apply(world.points))
+    size = np.array([camera.width, camera.height])
     point = np.flatnonzero(((pixel > 0) & (pixel < size)).all(axis=1) & (rng.random(len(pixel)) < detected))
     scale = rng.choice(_SCALES_PX, len(point) + clutter)
     keypoints = np.concatenate([pixel[point], rng.uniform(0, size, (clutter, 2))])
@@ -112,14 +140,14 @@ def photograph(
     descriptors = unit(descriptors + _DESCRIPTOR_NOISE * rng.normal(size=descriptors.shape))
     order = rng.permutation(len(keypoints))  # keypoints are sorted by score, which says nothing here
     features = Features(
-        (CAMERA.width, CAMERA.height),
+        (camera.width, camera.height),
         keypoints[order].astype(np.float32),
         np.linspace(1.0, 0.1, len(order), dtype=np.float32),
         scale[order].astype(np.float32),
         descriptors[order].astype(np.float32),
         np.zeros((len(order), 3), np.uint8),
     )
-    return Seen(pose, features, np.concatenate([point, np.full(clutter, -1)])[order], blunder[order])
+    return Seen(pose, features, np.concatenate([point, np.full(clutter, -1)])[order], blunder[order], camera)
 
 
 def common(a: Seen, b: Seen) -> Matches:
@@ -144,7 +172,8 @@ def loose_cov(pose: Rigid3, position_m: float, rotation_rad: float) -> Array:
 def reference_map(seen: Sequence[Seen], given: Sequence[Rigid3], noise: ReferenceNoise = NOISE) -> ReferenceMap:
     """Photographs as reference images r0, r1, ... at their given poses."""
     images = tuple(
-        Image(f"r{i}", Path(f"r{i}.jpg"), CAMERA, "reference", world_from_cam=pose) for i, pose in enumerate(given)
+        Image(f"r{i}", Path(f"r{i}.jpg"), photo.camera, "reference", world_from_cam=pose)
+        for i, (photo, pose) in enumerate(zip(seen, given, strict=True))
     )
 
     def read(image_id: str, count: int | None) -> Features:
@@ -154,9 +183,15 @@ def reference_map(seen: Sequence[Seen], given: Sequence[Rigid3], noise: Referenc
     return ReferenceMap(Campaign("reference", images), read, noise)
 
 
-def new_image(name: str, gnss: Array | None = None, sigma_m: float = 2.0, heading_rad: float | None = None) -> Image:
+def new_image(
+    name: str,
+    gnss: Array | None = None,
+    sigma_m: float = 2.0,
+    heading_rad: float | None = None,
+    camera: Camera = CAMERA,
+) -> Image:
     prior = None if gnss is None else PositionPrior(np.asarray(gnss, float), np.eye(3) * sigma_m**2)
-    return Image(name, Path(f"{name}.jpg"), CAMERA, "new", gnss=prior, heading_rad=heading_rad)
+    return Image(name, Path(f"{name}.jpg"), camera, "new", gnss=prior, heading_rad=heading_rad)
 
 
 def pose_nees(truth: Rigid3, estimate: Rigid3, cov: Array) -> float:
