@@ -233,6 +233,8 @@ def _explain(model: type[BaseModel], item: dict[str, Any]) -> str:
     if item["type"] == "missing":
         return f"The key '{key}' is missing."
     message = item["msg"].removeprefix("Value error, ")
+    if isinstance(item["input"], dict):  # what a section says as a whole, not one value in it
+        return f"{f'The section [{key}]' if key else 'The file'} cannot be used: {message}."
     return f"The key '{key}' has the value {item['input']!r}: {message[0].lower()}{message[1:]}."
 
 

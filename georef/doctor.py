@@ -6,6 +6,7 @@ import platform
 import re
 import shutil
 import sys
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
 from importlib import metadata
@@ -190,7 +191,11 @@ def _places(survey: Survey) -> Iterator[Finding]:
     """The CRS, how many images stand where, and whether the new ones are near the reference."""
     yield Finding("ok", _crs_text(survey.world.describe()))
     reference = np.array([i.world_from_cam.translation for i in survey.reference.images if i.world_from_cam])
-    yield Finding("ok", f"reference: {len(reference)} images over {_area(reference)}")
+    epochs = Counter(image.epoch for image in survey.reference.images)
+    several = f" of {len(epochs)} epochs ({', '.join(f'{n} {name}' for name, n in epochs.items())})"
+    text = f"reference: {len(reference)} images{several if len(epochs) > 1 else ''} over {_area(reference)}"
+    yield Finding("ok", text)
+    yield from _cameras(survey)
     new = np.array([i.gnss.position_in_world for i in survey.epoch.images if i.gnss]).reshape(-1, 3)
     text = f"epoch {survey.epoch.epoch}: {len(survey.epoch.images)} images, {len(new)} with GNSS"
     absent = [image.image_id for image in survey.epoch.images if not image.path.is_file()]
@@ -207,6 +212,26 @@ def _places(survey: Survey) -> Iterator[Finding]:
         "Most are far from the reference: check the CRS, the order of axes, and the epoch." if level != "ok" else ""
     )
     yield Finding(level, f"{text} over {_area(new)}{far}", remedy)
+
+
+def _cameras(survey: Survey) -> Iterator[Finding]:
+    """Cameras of the new images where there is more to say than their number: unknown ones, heads of panoramas."""
+    from georef.stages.panoramas import is_panorama
+
+    name, cameras = survey.epoch.epoch, [image.camera for image in survey.epoch.images]
+    unknown = [camera for camera in cameras if camera.estimate]
+    if unknown:
+        what = ", ".join(dict.fromkeys(name for camera in unknown for name in camera.estimate))
+        text = f"epoch {name}: {what} of {len(unknown)} images are estimated with their poses"
+        yield Finding("ok", text)
+    elif len({camera.camera_id for camera in cameras}) > 1:
+        counts = Counter(camera.camera_id for camera in cameras)
+        listed = ", ".join(f"{count} {camera_id}" for camera_id, count in list(counts.items())[:6])
+        yield Finding("ok", f"epoch {name}: images of {len(counts)} cameras: {listed}")
+    wrong = sorted({c.source.name for c in survey.cutouts if not is_panorama(c.source, c.projection)})
+    if wrong:
+        text = f"{len(wrong)} images are no panoramas of their declared projection: {', '.join(wrong[:5])}"
+        yield Finding("warning", text, "Their heads will be rejected: correct panorama.projection, or the images.")
 
 
 def _points(survey: Survey, epoch: str) -> Finding:

@@ -7,7 +7,7 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 from pydantic import Field, field_validator, model_validator
 
@@ -85,7 +85,7 @@ class EpochSection(Section):
     images: str
     cameras: str | None = None
     gnss: str | None = None
-    intrinsics: Literal["estimate"] | tuple[Unknown, ...] | None = None
+    intrinsics: str | tuple[str, ...] | None = None
     panorama: PanoramaSection | None = None
     table: TableSection = TableSection()
 
@@ -103,14 +103,19 @@ class EpochSection(Section):
     @field_validator("intrinsics")
     @classmethod
     def _possible(cls, value: Any) -> Any:
-        if isinstance(value, tuple) and (len(set(value)) < len(value) or {"k1", "k2"} & set(value) == {"k2"}):
+        names = (value,) if isinstance(value, str) else value or ()
+        if value != "estimate" and set(names) - set(get_args(Unknown)):
+            raise ValueError('expected "estimate", or a list of "focal", "k1", "k2"')
+        if len(set(names)) < len(names) or {"k1", "k2"} & set(names) == {"k2"}:
             raise ValueError('each of "focal", "k1", "k2" at most once, and k2 only together with k1')
         return value
 
     @property
     def unknown(self) -> tuple[Unknown, ...]:
         """Which intrinsics are to be estimated of every image of the epoch."""
-        return ("focal", "k1") if self.intrinsics == "estimate" else self.intrinsics or ()
+        given = ("focal", "k1") if self.intrinsics == "estimate" else self.intrinsics or ()
+        names = (given,) if isinstance(given, str) else given
+        return tuple(name for name in get_args(Unknown) if name in names)
 
 
 class PointsSection(Section):

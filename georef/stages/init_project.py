@@ -2,6 +2,8 @@
 
     reference_eo.csv  reference/   camera.csv   <epoch>_gnss.csv  <epoch>/   points.csv  marks_<epoch>.csv
 
+or several reference epochs and tables of cameras, see `init_files`.
+
 What the files declare in their comments is taken over; what nobody says is asked for, never guessed.
 """
 
@@ -10,10 +12,12 @@ from __future__ import annotations
 import json
 import re
 import tomllib
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal, get_args
+
+import numpy as np
 
 from georef.config import validated
 from georef.crs import LOCAL, CrsDefinition, choose_origin, crs_kind
@@ -23,11 +27,11 @@ from georef.io.declarations import ANGLE_NAMES, AngleConvention, AngleUnit, norm
 from georef.io.exterior_orientation import exterior_orientation_from_table
 from georef.io.files import write_text_atomically
 from georef.io.tables import Table, read_table
-from georef.project import PROJECT_FILE, ProjectFile
+from georef.project import PROJECT_FILE, REFERENCE, ProjectFile
+from georef.stages.init_files import EO_SUFFIX, GNSS_SUFFIX, Found, find_files
 from georef.types.constraints import CheckKind
 
-ORIENTATION, REFERENCE, CAMERAS, POINTS = "reference_eo.csv", "reference", "camera.csv", "points.csv"
-GNSS_SUFFIX, MARKS_PREFIX = "_gnss.csv", "marks_"
+POINTS, MARKS_PREFIX = "points.csv", "marks_"
 
 
 @dataclass(frozen=True)
@@ -56,6 +60,7 @@ class _Facts:
     """What was found out, with its sources."""
 
     tables: dict[str, Table]
+    found: Found
     values: dict[str, str] = field(default_factory=dict)
     said: list[str] = field(default_factory=list)
 
@@ -69,14 +74,14 @@ def init_project(folder: Path, data: Path, answers: Answers) -> Written:
             "Edit it, or name another folder for the new project.",
             f"In {path}.",
         )
-    epochs = _epochs(data)
-    facts = _Facts(_tables(data, epochs, answers.columns))
+    found = find_files(data)
+    facts = _Facts(_tables(found, answers.columns), found)
     definition = _definition(facts, answers)
     origin = _origin(facts, definition, answers)
-    text = _project_text(data, epochs, definition, origin, facts, answers)
+    text = _project_text(found, definition, origin, facts, answers)
     validated(ProjectFile, tomllib.loads(text), str(path))
     write_text_atomically(text, path)
-    facts.said.append(f"epochs: {', '.join(epochs)}")
+    facts.said.append(f"epochs: {', '.join(found.epochs)}")
     return Written(path, tuple(facts.said))
 
 
@@ -91,34 +96,10 @@ def parse_columns(texts: Iterable[str]) -> dict[str, str]:
     return out
 
 
-def _epochs(data: Path) -> list[str]:
-    """Names of the epochs: of the GNSS tables that stand beside a folder of that name."""
-    if not data.is_dir():
-        raise InputError("The folder of the data does not exist.", remedy="Correct --data.", path=data)
-    missing = [name for name in (ORIENTATION, REFERENCE, CAMERAS) if not (data / name).exists()]
-    if missing:
-        raise InputError(
-            f"The folder has no {' and no '.join(missing)}.",
-            expected=f"{ORIENTATION} (poses of the reference), {REFERENCE}/ (its images), {CAMERAS} (the camera).",
-            remedy="Rename the files, or write project.toml by hand: it can name any file.",
-            path=data,
-        )
-    epochs = sorted(p.name.removesuffix(GNSS_SUFFIX) for p in data.glob(f"*{GNSS_SUFFIX}"))
-    epochs = [name for name in epochs if (data / name).is_dir()]
-    if not epochs:
-        raise InputError(
-            "The folder has no new epoch.",
-            expected=f"a table <epoch>{GNSS_SUFFIX} beside a folder <epoch>/ with the new images.",
-            remedy="Rename the files, or write project.toml by hand: an epoch needs no GNSS there.",
-            path=data,
-        )
-    return epochs
-
-
-def _tables(data: Path, epochs: list[str], columns: Mapping[str, str]) -> dict[str, Table]:
-    names = [ORIENTATION, *(f"{epoch}{GNSS_SUFFIX}" for epoch in epochs)]
-    names += [POINTS] if (data / POINTS).is_file() else []
-    return {name: read_table(data / name, columns=columns) for name in names}
+def _tables(found: Found, columns: Mapping[str, str]) -> dict[str, Table]:
+    names = [*found.orientations, *(f"{epoch}{GNSS_SUFFIX}" for epoch in found.epochs)]
+    names += [POINTS] if (found.data / POINTS).is_file() else []
+    return {name: read_table(found.data / name, columns=columns) for name in names}
 
 
 def _definition(facts: _Facts, answers: Answers) -> CrsDefinition:
@@ -140,8 +121,8 @@ def _definition(facts: _Facts, answers: Answers) -> CrsDefinition:
 
 def _origin(facts: _Facts, definition: CrsDefinition, answers: Answers) -> list[float]:
     """Where the world frame is to stand: in the middle of the reference; reads its exterior orientation."""
-    table = facts.tables[ORIENTATION]
-    _require_axes(facts, table)
+    for name in facts.found.orientations:
+        _require_axes(facts, facts.tables[name])
     angles = _stated(facts, "angles", "--angles", answers.angles)
     convention: AngleConvention | None = next((name for name in ANGLE_NAMES if name == angles), None)
     if convention is None:
@@ -153,9 +134,17 @@ def _origin(facts: _Facts, definition: CrsDefinition, answers: Answers) -> list[
     unit = next((name for name in get_args(AngleUnit) if name == unit_text), None)
     if unit is None:
         raise _unknown(facts, "the unit of the angles", "--angle-unit deg, gon or rad")
-    orientation = exterior_orientation_from_table(table, crs_kind=_kind(facts), angles=convention, angle_unit=unit)
-    facts.said.append(f"reference: {len(orientation)} images, {convention} in {unit}")
-    return choose_origin(definition, orientation.positions_in_crs).tolist()
+    positions = []
+    for epoch, name in zip(facts.found.references, facts.found.orientations, strict=True):
+        table = facts.tables[name]
+        orientation = exterior_orientation_from_table(table, crs_kind=_kind(facts), angles=convention, angle_unit=unit)
+        facts.said.append(f"{_titled(epoch)}: {len(orientation)} images, {convention} in {unit}")
+        positions.append(orientation.positions_in_crs)
+    return choose_origin(definition, np.concatenate(positions)).tolist()
+
+
+def _titled(epoch: str) -> str:
+    return epoch if epoch == REFERENCE else f"reference {epoch}"
 
 
 def _kind(facts: _Facts) -> Any:
@@ -203,7 +192,7 @@ def _unknown(facts: _Facts, what: str, options: str) -> InputError:
         expected="a comment in the first lines, such as '# CRS: EPSG:25832, height: ellipsoidal. Angles: degrees, "
         "omega-phi-kappa'.",
         remedy=f"State it: {options}. It is never guessed.",
-        path=facts.tables[ORIENTATION].path,
+        path=facts.tables[facts.found.orientations[0]].path,
     )
 
 
@@ -221,21 +210,19 @@ def _check_kind(facts: _Facts, answers: Answers) -> str:
     )
 
 
-def _project_text(
-    data: Path, epochs: list[str], definition: CrsDefinition, origin: list[float], facts: _Facts, answers: Answers
-) -> str:
+def _project_text(found: Found, definition: CrsDefinition, origin: list[float], facts: _Facts, answers: Answers) -> str:
     mapping = ", ".join(f"{key} = {_quoted(value)}" for key, value in answers.columns.items())
     table = [f"table = {{ columns = {{ {mapping} }} }}"] if mapping else []
     lines = [
         "# File names are relative to the folder of the data: --data DIR, or GEOREF_DATA, or else this folder.",
-        f"name = {_quoted(answers.name or data.resolve().name)}",
+        f"name = {_quoted(answers.name or found.data.resolve().name)}",
         *_crs_text(definition, origin),
-        *_reference_text(facts, table),
+        *(line for epoch in found.references for line in _reference_text(epoch, facts, table)),
     ]
-    for epoch in epochs:
-        lines += ["", f"[epochs.{_key(epoch)}]", f"images = {_quoted(epoch)}", f'cameras = "{CAMERAS}"']
+    for epoch in found.epochs:
+        lines += ["", f"[epochs.{_key(epoch)}]", f"images = {_quoted(epoch)}", _cameras_text(epoch, facts)]
         lines += [f"gnss = {_quoted(epoch + GNSS_SUFFIX)}", *table]
-    return "\n".join([*lines, *_points_text(data, epochs, facts, answers, table)]) + "\n"
+    return "\n".join([*lines, *_points_text(found.data, found.epochs, facts, answers, table)]) + "\n"
 
 
 def _crs_text(definition: CrsDefinition, origin: list[float]) -> list[str]:
@@ -248,13 +235,23 @@ def _crs_text(definition: CrsDefinition, origin: list[float]) -> list[str]:
     ]
 
 
-def _reference_text(facts: _Facts, table: list[str]) -> list[str]:
+def _cameras_text(epoch: str, facts: _Facts) -> str:
+    """The line that says what cameras took an epoch's images."""
+    cameras = facts.found.cameras(epoch)
+    if cameras is not None:
+        return f"cameras = {_quoted(cameras)}"
+    facts.said.append(f"epoch {epoch}: no table of cameras, focal length and k1 are to be estimated")
+    return 'intrinsics = "estimate"  # no table of cameras was found'
+
+
+def _reference_text(epoch: str, facts: _Facts, table: list[str]) -> list[str]:
+    cameras = facts.found.cameras(epoch)
     return [
         "",
-        "[reference]",
-        f'images = "{REFERENCE}"',
-        f'cameras = "{CAMERAS}"',
-        f'exterior_orientation = "{ORIENTATION}"',
+        f"[{REFERENCE}]" if epoch == REFERENCE else f"[references.{_key(epoch)}]",
+        f"images = {_quoted(epoch)}",
+        *([f"cameras = {_quoted(cameras)}"] if cameras is not None else []),
+        f"exterior_orientation = {_quoted(epoch + EO_SUFFIX)}",
         f"angles = {_quoted(facts.values['angles'])}",
         f"angle_unit = {_quoted(facts.values['angle_unit'])}",
         'sigma = "estimate"  # or { position_m = [0.01, 0.01, 0.02], rotation_deg = [0.01, 0.01, 0.01] }',
@@ -262,7 +259,7 @@ def _reference_text(facts: _Facts, table: list[str]) -> list[str]:
     ]
 
 
-def _points_text(data: Path, epochs: list[str], facts: _Facts, answers: Answers, table: list[str]) -> list[str]:
+def _points_text(data: Path, epochs: Sequence[str], facts: _Facts, answers: Answers, table: list[str]) -> list[str]:
     marks = {epoch: f"{MARKS_PREFIX}{epoch}.csv" for epoch in epochs}
     marks = {epoch: name for epoch, name in marks.items() if (data / name).is_file()}
     if POINTS not in facts.tables or not marks:

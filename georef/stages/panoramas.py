@@ -140,6 +140,14 @@ def _digest(path: Path, projection: Projection, head: PanoramaHead) -> str:
     return hashlib.sha256(json.dumps(parts).encode()).hexdigest()[:12]
 
 
+def is_panorama(path: Path, projection: Projection) -> bool:
+    """Whether an image has the shape of its projection; a file that cannot be read is not judged."""
+    try:
+        return not expected_size(projection, image_size(path))
+    except (OSError, SyntaxError, ValueError):
+        return True
+
+
 def cut_missing(cutouts: Iterable[CutOut], executor: Executor) -> dict[Path, tuple[str, str]]:
     """Cuts the heads that are not there yet; those that cannot be cut, by their paths, with the reason."""
     pending: dict[Path, list[CutOut]] = {}

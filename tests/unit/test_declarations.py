@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from PIL import Image as PillowImage
 
+from georef.doctor import check_project
 from georef.errors import ConfigError, InputError
 from georef.executor import Executor
 from georef.features.images import read_image
@@ -19,6 +20,7 @@ from georef.io.exif import size_and_focal
 from georef.io.head_table import read_heads
 from georef.project import open_project
 from georef.stages.base import feature_id
+from georef.stages.init_project import Answers, init_project
 from georef.stages.network import declared_noise
 from georef.stages.panoramas import cut_missing
 from georef.stages.survey import Survey, load_survey
@@ -324,3 +326,40 @@ def test_positions_of_heads_need_the_radius_of_stitching(tmp_path: Path) -> None
     (tmp_path / "heads.csv").write_text(HEAD_TABLE, encoding="utf-8")
     with pytest.raises(InputError, match=r"(?s)nothing says how the panorama was stitched.*stitching_radius_m"):
         read_heads(tmp_path / "heads.csv")
+
+
+# --- init and doctor ------------------------------------------------------------------------------
+
+
+def test_init_finds_several_references_and_their_cameras(tiny_tables: Path, tmp_path: Path) -> None:
+    two_references(tiny_tables)
+    (tiny_tables / "reference_eo.csv").rename(tiny_tables / "old_eo.csv")
+    (tiny_tables / "reference").rename(tiny_tables / "old")
+    (tiny_tables / "camera.csv").rename(tiny_tables / "cameras_old.csv")
+    shutil.copy(tiny_tables / "cameras_old.csv", tiny_tables / "cameras_new.csv")
+    (tiny_tables / "project.toml").unlink()
+    written = init_project(tmp_path / "made", tiny_tables, Answers(check_kind="absolute"))
+    made = open_project(tmp_path / "made", data=tiny_tables)
+    assert list(made.file.reference_epochs) == ["new", "old"]
+    assert made.file.reference_epochs["old"].cameras == "cameras_old.csv"
+    assert made.file.epochs[EPOCH].unknown == ("focal", "k1")
+    assert "reference old: 8 images, omega-phi-kappa in deg" in written.said
+    assert f"epoch {EPOCH}: no table of cameras, focal length and k1 are to be estimated" in written.said
+    assert len(load_survey(made, EPOCH).reference.images) == 16
+
+
+def test_the_doctor_says_what_is_declared(two_cameras: Path, panoramas: Path) -> None:
+    """The same tables: two cameras a reference epoch, and panoramas of which one has a wrong shape."""
+    cv2.imwrite(str(panoramas / EPOCH / "n1.jpg"), np.zeros((60, 80, 3), np.uint8))
+    findings = {finding.text: finding for finding in check_project(open_project(panoramas))}
+    assert any(text.startswith("reference: 8 images over") for text in findings)
+    assert f"epoch {EPOCH}: images of 2 cameras: 3 front, 3 right" in findings
+    wrong = findings["1 images are no panoramas of their declared projection: n1.jpg"]
+    assert wrong.level == "warning"
+
+
+def test_the_doctor_names_reference_epochs_and_unknown_cameras(tiny_tables: Path) -> None:
+    edited(two_references(tiny_tables), "project.toml", "\ngnss", '\nintrinsics = ["focal", "k1"]\ngnss')
+    texts = [finding.text for finding in check_project(open_project(tiny_tables))]
+    assert any(text.startswith("reference: 16 images of 2 epochs (8 old, 8 2025.1) over") for text in texts)
+    assert f"epoch {EPOCH}: focal, k1 of 3 images are estimated with their poses" in texts

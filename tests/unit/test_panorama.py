@@ -133,7 +133,7 @@ def test_a_cut_head_shows_each_thing_within_a_tenth_of_a_pixel(
     assert np.abs(shift).max() < 0.01  # half a pixel of a wrong convention would show at once
     blocks = [
         np.linalg.lstsq(np.column_stack([a.ravel(), d.ravel()]), e.ravel(), rcond=None)[0]
-        for a, d, e in zip(*(tiles(v) for v in (across, down, error)), strict=True)
+        for a, d, e in zip(*(tiles(np.asarray(v)) for v in (across, down, error)), strict=True)
     ]
     assert np.abs(blocks).max() < 0.1
 

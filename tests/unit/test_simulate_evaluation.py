@@ -26,7 +26,7 @@ from georef.simulate.evaluation import (
     evaluation_options,
     panorama_heads,
 )
-from georef.simulate.evaluation_files import PRIORS, write_evaluation_images, write_evaluation_tables
+from georef.simulate.evaluation_files import PRIORS, project_toml, write_evaluation_images, write_evaluation_tables
 from georef.simulate.evaluation_images import panorama_layout, products
 from georef.simulate.project_files import TRUTH
 from georef.simulate.world import small_options
@@ -187,3 +187,8 @@ def test_an_interrupted_writing_goes_on(world: EvaluationWorld, folder: Path) ->
     assert write_evaluation_images(world, folder) == []
     with pytest.raises(InputError, match="other options"):
         write_evaluation_tables(EvaluationWorld(replace(SMALL, seed=3)), folder)
+
+
+def test_the_project_in_the_repository_is_the_one_that_is_written() -> None:
+    written = (Path(__file__).parents[2] / "projects" / "evaluation" / "project.toml").read_text(encoding="utf-8")
+    assert written == project_toml(EvaluationWorld(evaluation_options(0)))
