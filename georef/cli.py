@@ -11,17 +11,29 @@ import sys
 import time
 from collections.abc import Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import App, Parameter
 
 from georef import __version__
+from georef.cli_common import (
+    REPEATED,
+    Crs,
+    Data,
+    Epoch,
+    Height,
+    Output,
+    Preset,
+    ProjectArgument,
+    Settings,
+    local_executor,
+)
+from georef.cli_evaluate import evaluate
 from georef.cli_weights import weights
-from georef.terminal import exit_code, say, say_table
+from georef.terminal import exit_code, say
 
 if TYPE_CHECKING:
     from georef.doctor import Finding
-    from georef.executor import Executor
     from georef.project import Project
 
 app = App(
@@ -32,16 +44,7 @@ app = App(
     suppress_keyboard_interrupt=False,
 )
 app.command(weights)
-
-_REPEATED: Any = {"consume_multiple": False, "negative": (), "show_default": False}
-ProjectArgument = Annotated[Path, Parameter(help="Project folder, or its project.toml.")]
-Data = Annotated[Path | None, Parameter(name="--data", help="Folder with the data; else GEOREF_DATA.")]
-Output = Annotated[Path | None, Parameter(name=["--output", "-o"], help="Where all results go; else the project.")]
-Epoch = Annotated[str | None, Parameter(help="Epoch to work on; needed where the project has several.")]
-Preset = Annotated[str | None, Parameter(help="A preset of configs/, or the path of a TOML file.")]
-Settings = Annotated[tuple[str, ...], Parameter(name="--set", help="section.key=value, may be repeated.", **_REPEATED)]
-Crs = Annotated[str | None, Parameter(name="--crs", help="EPSG:code or local; else what the files declare.")]
-Height = Annotated[str | None, Parameter(help="ellipsoidal, or a vertical CRS; else what the files declare.")]
+app.command(evaluate)
 
 
 @app.command
@@ -59,7 +62,7 @@ def init(
         Literal["absolute", "relative"] | None, Parameter(help="Check points: surveyed, or from the reference.")
     ] = None,
     column: Annotated[
-        tuple[str, ...], Parameter(help="easting=X: which column is which; may be repeated.", **_REPEATED)
+        tuple[str, ...], Parameter(help="easting=X: which column is which; may be repeated.", **REPEATED)
     ] = (),
     name: Annotated[str | None, Parameter(help="Name of the project; else that of the folder of the data.")] = None,
 ) -> int:
@@ -127,7 +130,7 @@ def demo(
     folder = survey_files(options)
     project = open_project(folder, data=folder, output=output, preset=preset, settings=set_)
     start = time.process_time()
-    street = render_missing(options, folder, _executor(project))
+    street = render_missing(options, folder, local_executor(project))
     cost = f"{street.computed} rendered, {time.process_time() - start:.0f} CPU-s" if street.computed else "kept"
     say(f"{'render':<9} {street.line}  [{cost}]")
     code = 0
@@ -195,55 +198,6 @@ def view(
     return 0
 
 
-@app.command
-def evaluate(
-    project: Annotated[Path | None, Parameter(help="Project folder, or its project.toml; or name --poses.")] = None,
-    *,
-    truth: Annotated[Path, Parameter(help="True exterior orientation of the same images.")],
-    truth_sigma: Annotated[
-        str | None, Parameter(help="How well the truth is known: POSITION_M,ROTATION_DEG, 1-sigma per axis.")
-    ] = None,
-    tables: Annotated[str | None, Parameter(help="Of a project: these tables alone, e.g. features,models.")] = None,
-    variants: Annotated[
-        Path | None, Parameter(help="Of a project: a TOML file of tables; else configs/evaluation/default.toml.")
-    ] = None,
-    data: Data = None,
-    epoch: Epoch = None,
-    preset: Preset = None,
-    set_: Settings = (),
-    poses: Annotated[
-        Path | None, Parameter(help="A file of poses alone: as georef writes them, or a plain exterior orientation.")
-    ] = None,
-    crs: Crs = None,
-    height: Height = None,
-    output: Annotated[
-        Path | None,
-        Parameter(name=["--output", "-o"], help="Of a project: where all results go. Of poses: the JSON file."),
-    ] = None,
-) -> int:
-    """Compare with the truth: variants of a project as tables, curves and a page, or one file of poses."""
-    from georef.stages.evaluate import describe, evaluate, one_of, parse_truth_sigma, write_evaluation
-
-    sigmas = None if truth_sigma is None else parse_truth_sigma(truth_sigma)
-    one_of(project, poses)
-    if poses is not None:
-        result = evaluate(poses, truth, crs=crs, height=height, truth_sigmas=sigmas)
-        say(*describe(result), f"written     {write_evaluation(result, output)}")
-        return 0
-    assert project is not None
-    from georef.comparison.evaluate import compare, write_comparison
-    from georef.comparison.run import Source
-
-    source = Source(project, data, output, epoch, preset, set_)
-    wanted = [name.strip() for name in (tables or "").split(",") if name.strip()]
-    executor = _executor(source.open()[0])
-    comparison = compare(source, truth, sigmas, variants=variants, wanted=wanted, executor=executor, say=say)
-    for table in comparison.tables:
-        say_table(table.to_dict())
-    say("", *(f"written     {path}" for path in write_comparison(comparison)))
-    return 0
-
-
 def _open(
     project: Path,
     data: Path | None,
@@ -263,7 +217,7 @@ def _run(project: Project, epoch: str) -> int:
     from georef.pipeline import run_pipeline
 
     report = None
-    for result in run_pipeline(project, epoch, _executor(project)):
+    for result in run_pipeline(project, epoch, local_executor(project)):
         cost = (
             "kept" if result.reused else f"{result.timing['cpu_s']:.0f} CPU-s, {result.timing['peak_memory_mb']:.0f} MB"
         )
@@ -271,19 +225,6 @@ def _run(project: Project, epoch: str) -> int:
         report = result.summary.data
     _say_published(project, epoch)
     return 3 if report is not None and report["images"]["localized"] == 0 else 0
-
-
-def _executor(project: Project) -> Executor:
-    from georef.executor import Executor
-
-    return Executor(project.config.run.workers, project.config.run.threads, _progress())
-
-
-def _progress():
-    """A bar on a terminal; a line every half minute where output is a file."""
-    from georef.progress import Bars, Lines
-
-    return Bars() if sys.stderr.isatty() else Lines()
 
 
 def _report_findings(findings: Iterable[Finding]) -> set[str]:

@@ -43,14 +43,28 @@ ALLOWED: dict[str, set[str]] = {
     },
     "doctor": {"errors", "config", "project", "features", "stages"},
     "terminal": {"errors"},
+    "cli_common": {"executor", "progress", "project"},
+    "cli_evaluate": {"errors", "terminal", "cli_common", "comparison", "stages"},
     "cli_weights": {"errors", "terminal", "doctor", "features"},
     "cli": {
-        *("errors", "terminal", "cli_weights", "doctor", "project", "executor", "progress", "pipeline", "stages"),
-        *("comparison", "viewer", "capture", "simulate"),
+        *(
+            "errors",
+            "terminal",
+            "cli_common",
+            "cli_evaluate",
+            "cli_weights",
+            "doctor",
+            "project",
+            "executor",
+            "progress",
+            "pipeline",
+            "stages",
+        ),
+        *("viewer", "capture", "simulate"),
     },
 }
 FOLDER_NAMES = {"work", "epochs", "campaigns"}  # inside a project
-SPEAKING = {"terminal", "progress", "cli"}  # what may write to a standard stream
+SPEAKING = {"terminal", "progress", "cli", "cli_common"}  # what may write to a standard stream
 GROWN_LINES = 300
 
 

@@ -100,10 +100,10 @@ def test_all_tables_and_files(copied: Callable[..., Bench], tables: Path) -> Non
     data = json.loads(paths["evaluation.json"].read_text(encoding="utf-8"))
     assert data["curves"]["models"]["local"]["position_m"]["total"] == 3
     assert data["errors"]["models"]["nothing"]["failed"] == ["n0.jpg", "n1.jpg", "n2.jpg"]
-    assert "not run. There is no matcher 'no-such'" in paths["evaluation.html"].read_text(encoding="utf-8")
-    stored = list(csv.DictReader(paths["models.csv"].open(encoding="utf-8")))
+    assert "not run. There is no matcher &#39;no-such&#39;" in paths["evaluation.html"].read_text(encoding="utf-8")
+    stored = list(csv.DictReader(paths["models.csv"].read_text(encoding="utf-8").splitlines()))
     assert float(stored[0]["median_position_m"]) == pytest.approx(models["local"]["median_position"]["value"])
-    curve = list(csv.DictReader(paths["models-curves.csv"].open(encoding="utf-8")))
+    curve = list(csv.DictReader(paths["models-curves.csv"].read_text(encoding="utf-8").splitlines()))
     assert (curve[0]["limit"], curve[-1]["limit"], curve[-1]["local_percent"]) == ("0.0005", "10", "100")
     assert paths["models-position.svg"].read_text(encoding="utf-8").startswith("<svg ")
 

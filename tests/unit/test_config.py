@@ -102,7 +102,10 @@ def test_an_unknown_key_of_a_preset_names_its_file(tmp_path: Path) -> None:
         ({"netwrk": {}}, ["Unknown key 'netwrk'. Did you mean 'network'?", "adjust, candidates"]),
         ({"adjust": {"gns": True}}, ["Unknown key 'adjust.gns'. Did you mean 'gnss'?"]),
         ({"adjust": {"gate_probability": 1.5}}, ["'adjust.gate_probability' has the value 1.5", "less than 1"]),
-        ({"candidates": {"box": "round"}}, ["'candidates.box' has the value 'round'", "'reach' or 'published'"]),
+        (
+            {"candidates": {"box": "round"}},
+            ["'candidates.box' has the value 'round'", "'reach', 'published', 'fixed' or 'none'"],
+        ),
         ({"features": {"max_keypoints": 3}}, ["'features.max_keypoints' has the value 3", "16"]),
         ({"features": {"max_keypoints": "many"}}, ["'features.max_keypoints' has the value 'many'", "integer"]),
         ({"localize": {"ransac_gate_px": float("nan")}}, ["'localize.ransac_gate_px' has the value nan", "finite"]),

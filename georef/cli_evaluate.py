@@ -1,0 +1,59 @@
+"""The verb `evaluate`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+from cyclopts import Parameter
+
+from georef.cli_common import Crs, Data, Epoch, Height, Preset, Settings, local_executor
+from georef.terminal import say, say_table
+
+
+def evaluate(
+    project: Annotated[Path | None, Parameter(help="Project folder, or its project.toml; or name --poses.")] = None,
+    *,
+    truth: Annotated[Path, Parameter(help="True exterior orientation of the same images.")],
+    truth_sigma: Annotated[
+        str | None, Parameter(help="How well the truth is known: POSITION_M,ROTATION_DEG, 1-sigma per axis.")
+    ] = None,
+    tables: Annotated[str | None, Parameter(help="Of a project: these tables alone, e.g. features,models.")] = None,
+    variants: Annotated[
+        Path | None, Parameter(help="Of a project: a TOML file of tables; else configs/evaluation/default.toml.")
+    ] = None,
+    data: Data = None,
+    epoch: Epoch = None,
+    preset: Preset = None,
+    set_: Settings = (),
+    poses: Annotated[
+        Path | None, Parameter(help="A file of poses alone: as georef writes them, or a plain exterior orientation.")
+    ] = None,
+    crs: Crs = None,
+    height: Height = None,
+    output: Annotated[
+        Path | None,
+        Parameter(name=["--output", "-o"], help="Of a project: where all results go. Of poses: the JSON file."),
+    ] = None,
+) -> int:
+    """Compare with the truth: variants of a project as tables, curves and a page, or one file of poses."""
+    from georef.stages.evaluate import describe, evaluate, one_of, parse_truth_sigma, write_evaluation
+
+    sigmas = None if truth_sigma is None else parse_truth_sigma(truth_sigma)
+    one_of(project, poses)
+    if poses is not None:
+        result = evaluate(poses, truth, crs=crs, height=height, truth_sigmas=sigmas)
+        say(*describe(result), f"written     {write_evaluation(result, output)}")
+        return 0
+    assert project is not None
+    from georef.comparison.evaluate import compare, write_comparison
+    from georef.comparison.run import Source
+
+    source = Source(project, data, output, epoch, preset, set_)
+    wanted = [name.strip() for name in (tables or "").split(",") if name.strip()]
+    executor = local_executor(source.open()[0])
+    comparison = compare(source, truth, sigmas, variants=variants, wanted=wanted, executor=executor, say=say)
+    for table in comparison.tables:
+        say_table(table.to_dict())
+    say("", *(f"written     {path}" for path in write_comparison(comparison)))
+    return 0
