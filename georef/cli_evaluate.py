@@ -18,7 +18,7 @@ def evaluate(
     truth_sigma: Annotated[
         str | None, Parameter(help="How well the truth is known: POSITION_M,ROTATION_DEG, 1-sigma per axis.")
     ] = None,
-    tables: Annotated[str, Parameter(help="Of a project: these tables alone, e.g. features,models.")] = "",
+    tables: Annotated[str | None, Parameter(help="Of a project: these tables alone, e.g. features,models.")] = None,
     variants: Annotated[
         Path | None, Parameter(help="Of a project: a TOML file of tables; else configs/evaluation/default.toml.")
     ] = None,
@@ -49,7 +49,7 @@ def evaluate(
     from georef.comparison.run import Source
 
     source = Source(project, data, output, epoch, choice.preset, choice.set_)
-    wanted = [name.strip() for name in tables.split(",") if name.strip()]
+    wanted = [name.strip() for name in (tables or "").split(",") if name.strip()]
     executor = executor_of(source.open()[0])
     comparison = compare(source, truth, sigmas, variants=variants, wanted=wanted, executor=executor, say=say)
     for table in comparison.tables:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import os
+import re
 import sys
 from typing import Any
 
@@ -33,7 +34,7 @@ def say_table(table: dict[str, Any]) -> None:
     shown = Table(title=table["title"], box=SIMPLE_HEAD, title_justify="left", title_style="bold", pad_edge=False)
     for column in table["columns"]:
         left = not column["unit"] and column["key"] in _TEXT_COLUMNS
-        heading = column["heading"].replace(", ", ",\n").replace(" (", "\n(").replace(": ", ":\n")
+        heading = re.sub(r"(?<=[,:]) | (?=\()|(?<=median) ", "\n", column["heading"])
         shown.add_column(heading, justify="left" if left else "right", overflow="fold")
     for row in table["shown"]:
         shown.add_row(*(f"{value}\n{interval}" if interval else value for value, interval in row))

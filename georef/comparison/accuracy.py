@@ -24,8 +24,8 @@ _FIRST = (Column("name", ""), Column("images", "images"))
 _ACCURACY = (
     *_FIRST,
     Column("localized", "localized", "%", 0, interval=True),
-    Column("median_position", "median, position", "m", 1, 1e3, "mm", interval=True),
-    Column("median_rotation", "median, rotation", "deg", 4, interval=True),
+    Column("median_position", "median position", "m", 1, 1e3, "mm", interval=True),
+    Column("median_rotation", "median rotation", "deg", 4, interval=True),
     *(
         Column(f"within_{p:g}m_{r:g}deg", f"{p:g} m, {r:g}\N{DEGREE SIGN}", "%", 0, interval=True)
         for p, r in THRESHOLDS
@@ -37,8 +37,8 @@ _RETRIEVAL = (
     *(Column(f"recall_at_{rank}", f"recall @{rank}", "%", 0, interval=True) for rank in RANKS),
     Column("precision", f"right of {RANKS[-1]}", "%", 0),
     *(Column(name, f"{name}: {p:g} m, {r:g}\N{DEGREE SIGN}", "%", 0, interval=True) for name, (p, r) in LEVELS.items()),
-    Column("median_position", "median, position", "m", 1, 1e3, "mm", interval=True),
-    Column("median_rotation", "median, rotation", "deg", 4, interval=True),
+    Column("median_position", "median position", "m", 1, 1e3, "mm", interval=True),
+    Column("median_rotation", "median rotation", "deg", 4, interval=True),
 )
 _RIGHT = (
     "A candidate is right where its viewing frustum and that of the query at its true pose have at least a fifth in "

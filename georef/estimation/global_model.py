@@ -13,7 +13,7 @@ from dataclasses import replace
 import numpy as np
 import pycolmap
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from georef.estimation.guided import PosedFeatures, epipolar_distances
 from georef.estimation.local_model import LocalModel
@@ -37,7 +37,7 @@ def choose_pairs(frusta: Frusta, neighbours: int) -> list[Pair]:
     """Pairs (a < b) of references: each with those of the nearest that share most of its view, at most `neighbours`."""
     centres = frusta.views.centres
     tried = min(_TRIED_PER_NEIGHBOUR * neighbours + 1, len(centres))
-    near = cKDTree(centres).query(centres, k=tried, distance_upper_bound=2.0 * frusta.reach_m)[1].reshape(-1, tried)
+    near = KDTree(centres).query(centres, k=tried, distance_upper_bound=2.0 * frusta.reach_m)[1].reshape(-1, tried)
     pairs: set[Pair] = set()
     for index, row in enumerate(near):
         others = row[(row != index) & (row < len(centres))]
@@ -182,7 +182,7 @@ def _structure(
     solved = triangulate(views, obs.point, obs.view, obs.pixel, obs.sigma_px, len(with_point))
     first = np.flatnonzero(np.diff(obs.point, prepend=-1))
     place = np.array(members, dtype=np.int64)
-    known = np.isfinite(solved.points).all(axis=1) & np.isfinite(solved.cov).all(axis=(1, 2))
+    known = np.asarray(np.isfinite(solved.points).all(axis=1) & np.isfinite(solved.cov).all(axis=(1, 2)))
     renumber = np.cumsum(known) - 1
     kept = obs.take(known[obs.point])
     return ImageStructure(

@@ -18,6 +18,7 @@ from georef.geometry.rigid import Array, Rigid3
 
 _ACROSS, _DOWN, _DEPTHS = 8, 6, 6
 _NEAREST_SHARE = 0.1  # of the reach
+_AT_MOST = 1.0 + 1e-9  # rounding
 _LARGEST_ANGLE_DEG = 60.0  # between two rays to one point: beyond it the point does not look the same
 
 
@@ -67,5 +68,5 @@ class Frusta:
         rays, others = points - self.views.centres[index], points - centre
         distance, other_distance = np.linalg.norm(rays, axis=1), np.linalg.norm(others, axis=1)
         cosine = np.einsum("ni,ni->n", rays, others) / np.maximum(distance * other_distance, 1e-12)
-        seen = ((pixels >= 0) & (pixels <= self.sizes[index])).all(axis=1) & (distance <= self.reach_m)
+        seen = ((pixels >= 0) & (pixels <= self.sizes[index])).all(axis=1) & (distance <= _AT_MOST * self.reach_m)
         return float(np.mean(seen & (cosine >= np.cos(np.radians(_LARGEST_ANGLE_DEG)))))

@@ -29,11 +29,8 @@ class MapTask:
 
     localize: LocalizeTask
     folder: Path
+    ids: tuple[str, ...]  # of the references, by their place
     pairs: tuple[Pair, ...]
-
-    @cached_property
-    def ids(self) -> list[str]:
-        return [image.image_id for image in self.localize.map.images]
 
     @cached_property
     def partners(self) -> dict[int, list[Pair]]:
@@ -89,20 +86,20 @@ class TriangulateTask(MapTask):
 
 def run(context: StageContext) -> StageSummary:
     """Matches what is not matched yet, then triangulates the blocks that are not complete."""
-    localize = make_task(context)
-    reference, config = localize.map, context.config.global_map
-    cameras = [image.camera for image in reference.images]
+    reference, config = make_task(context).map, context.config.global_map
+    ids, cameras = tuple(i.image_id for i in reference.images), [i.camera for i in reference.images]
     pairs = tuple(choose_pairs(Frusta.of(reference.poses, cameras, config.viewing_reach_m), config.neighbours))
-    match, triangulate = MatchTask(localize, context.folder, pairs), TriangulateTask(localize, context.folder, pairs)
+    match = MatchTask(make_task(context), context.folder, ids, pairs)
+    triangulate = TriangulateTask(make_task(context), context.folder, ids, pairs)
     done = item_ids(context.folder / MATCHES)
-    pending = [index for index, name in enumerate(match.ids) if name not in done]
+    pending = [index for index, name in enumerate(ids) if name not in done]
     for _ in context.executor.map_items(match, pending, "map matching"):
         pass
     there = item_ids(context.folder / STRUCTURE)
     blocks = [
         block
         for block in blocks_of(reference.positions, config.block_images)
-        if not there.issuperset(match.ids[int(i)] for i in block)
+        if not there.issuperset(ids[int(i)] for i in block)
     ]
     for _ in context.executor.map_items(triangulate, blocks, "map points"):
         pass

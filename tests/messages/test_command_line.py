@@ -265,7 +265,7 @@ def test_evaluate_counts_failed_images_as_infinitely_wrong(tmp_path: Path, capsy
     assert "median infinite" in text
     assert "within      0.025 m and  0.25 deg:  25.0 %" in text
     assert "within      0.050 m and  0.50 deg:  50.0 %" in text
-    stored = json.loads((tmp_path / "evaluation.json").read_text(encoding="utf-8"))
+    stored = json.loads((tmp_path / "evaluation-poses.json").read_text(encoding="utf-8"))
     assert stored["failed"] == ["n2.jpg", "n3.jpg"]
     assert stored["position_m"]["median"] is None
     assert stored["images"][0]["dh_m"] == pytest.approx(0.03, abs=1e-5)
@@ -293,4 +293,4 @@ def test_evaluate_explains_what_it_misses(
     (tmp_path / "poses.csv").write_text(poses + ("" if "other" in poses else row), encoding="utf-8")
     assert called("evaluate", "--poses", tmp_path / "poses.csv", "--truth", tmp_path / "truth.csv", *options) == 1
     assert text in capsys.readouterr().err
-    assert not (tmp_path / "evaluation.json").exists()
+    assert not (tmp_path / "evaluation-poses.json").exists()

@@ -104,7 +104,7 @@ def test_an_unknown_key_of_a_preset_names_its_file(tmp_path: Path) -> None:
         ({"adjust": {"gate_probability": 1.5}}, ["'adjust.gate_probability' has the value 1.5", "less than 1"]),
         (
             {"candidates": {"box": "round"}},
-            ["'candidates.box' has the value 'round'", "'published', 'fixed' or 'none'"],
+            ["'candidates.box' has the value 'round'", "'reach', 'published', 'fixed' or 'none'"],
         ),
         ({"features": {"max_keypoints": 3}}, ["'features.max_keypoints' has the value 3", "16"]),
         ({"features": {"max_keypoints": "many"}}, ["'features.max_keypoints' has the value 'many'", "integer"]),
