@@ -58,7 +58,7 @@ ALLOWED: dict[str, set[str]] = {
     },
 }
 FOLDER_NAMES = {"work", "epochs", "campaigns"}  # inside a project
-SPEAKING = {"terminal", "progress", "cli", "cli_common"}  # what may write to a standard stream
+SPEAKING = {"terminal", "progress", "cli", "cli_options"}  # what may write to a standard stream
 GROWN_LINES = 300
 
 

@@ -15,9 +15,9 @@ import pycolmap
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
+from georef.estimation.first_pose import QueryImage
 from georef.estimation.guided import PosedFeatures, epipolar_distances
 from georef.estimation.local_model import LocalModel
-from georef.estimation.pnp import QueryImage
 from georef.estimation.published import triangulated
 from georef.features.base import Matcher
 from georef.geometry.frusta import Frusta
@@ -128,7 +128,7 @@ def global_model(
 def one_point_each(pose: Rigid3, query: QueryImage, model: LocalModel, inliers: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Of the inliers (P,) that share a query keypoint, the one that the pose projects nearest to it."""
     views = Views.of([pose], [query.camera])
-    off = views.project(np.zeros(len(model), np.int64), model.points) - query.ideal_px[model.keypoint]
+    off = views.project(np.zeros(len(model), np.int64), model.points) - query.pixels[model.keypoint]
     distance = np.where(inliers, np.nan_to_num(np.linalg.norm(off, axis=1), nan=np.inf), np.inf)
     order = np.lexsort([distance, model.keypoint])
     first = np.unique(model.keypoint[order], return_index=True)[1]
@@ -175,7 +175,7 @@ def _structure(
         for element in reconstruction.point3D(point).track.elements
     )
     table = np.array(rows, dtype=np.int64).reshape(-1, 3)
-    pixel = np.array([references[v].ideal_px[k] for _, v, k in rows]).reshape(-1, 2)
+    pixel = np.array([references[v].pixels[k] for _, v, k in rows]).reshape(-1, 2)
     scale = np.array([references[v].features.scales_px[k] for _, v, k in rows], dtype=np.float64)
     obs = Observations(table[:, 0], table[:, 1], pixel, noise.keypoint_sigma * scale, table[:, 2])
     views = Views.of([r.world_from_cam for r in references], [r.camera for r in references])
