@@ -37,12 +37,14 @@ class Reservoir:
         kept = places >= 0
         if not kept.any():
             return
-        if self._rows is None:
-            self._rows = np.zeros((min(self._capacity, 1024), rows.shape[1]), np.float32)
-        while places.max() >= len(self._rows):  # grows as the stream does: a small map takes little memory
-            more = min(len(self._rows), self._capacity - len(self._rows))
-            self._rows = np.concatenate([self._rows, np.zeros((more, self._rows.shape[1]), np.float32)])
-        self._rows[places[kept]] = rows[kept]
+        held = self._rows
+        if held is None:
+            held = np.zeros((min(self._capacity, 1024), rows.shape[1]), np.float32)
+        while places.max() >= len(held):  # grows as the stream does: a small map takes little memory
+            more = min(len(held), self._capacity - len(held))
+            held = np.concatenate([held, np.zeros((more, held.shape[1]), np.float32)])
+        held[places[kept]] = rows[kept]
+        self._rows = held
 
     def add(self, rows: NDArray[np.floating]) -> None:
         """Offer rows (n, D)."""

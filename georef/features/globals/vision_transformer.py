@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import cast
 
 import torch
 from torch import Tensor, nn
@@ -55,7 +56,7 @@ class VisionTransformer(nn.Module):
         x = self.embed(image)
         for block in self.blocks[:layer]:
             x = block(x)
-        last = self.blocks[layer]
+        last = cast(_Block, self.blocks[layer])
         return last.attn.qkv(last.norm1(x)).chunk(3, -1)[2][:, 1:]
 
     def embed(self, image: Tensor) -> Tensor:
