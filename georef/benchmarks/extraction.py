@@ -60,7 +60,7 @@ def extraction_costs(
 
 
 def compared_with_kornia(images: Sequence[Path], level_px: int = 2048, threads: int = 1) -> Comparison:
-    """ALIKED n16 here and by kornia's module with the same weights and threshold, in fresh processes of one run.
+    """ALIKED n16 here and by kornia's module with the same weights and no threshold, in fresh processes of one run.
 
     Raises WeightsError where the weights are not in the cache.
     """
@@ -125,7 +125,7 @@ def _detect_all(whose: str, images: tuple[Path, ...], level_px: int, threads: in
 
 
 def _own_detector() -> Detect:
-    extractor = load_component(EXTRACTORS, "aliked-n16", detection_threshold=0.05)
+    extractor = load_component(EXTRACTORS, "aliked-n16", detection_threshold=0.0)
     return lambda image, budget: extractor.detect(image, budget).keypoints_px
 
 
@@ -138,7 +138,7 @@ def _kornias_detector() -> Detect:
     weights = load_state_dict("aliked-n16")
 
     def detect(image: np.ndarray, budget: int) -> np.ndarray:
-        network = ALIKED("aliked-n16", max_num_keypoints=budget, detection_threshold=0.05).eval()
+        network = ALIKED("aliked-n16", max_num_keypoints=budget, detection_threshold=0.0).eval()
         network.load_state_dict(weights, strict=False)
         with torch.inference_mode():
             pixels = torch.from_numpy(image).permute(2, 0, 1)[None].float() / 255
