@@ -59,7 +59,7 @@ def ransac_pose(query: QueryImage, model: LocalModel, gate_px: float, seed: int)
         guesses = _fisheyes(query.camera) if unknown_focal else _distortions(query.camera)
         tried = [_with_known_focal(camera, pixels, model, gate_px, seed) for camera in guesses]
         found = [first for first in tried if first is not None]
-    # A wide gate lets a wrong guess pass: of equal counts the one that fits better.
+    # Within a wide gate wrong guesses find as many points as the right one: their residuals tell.
     return max(found, key=lambda first: _score(first, pixels, model, gate_px), default=None)
 
 
@@ -73,7 +73,7 @@ def _with_known_focal(camera: Camera, pixels: Array, model: LocalModel, gate_px:
     lens = colmap_camera(camera)
     if camera.model == "fisheye" and (rays[shown, 2] < _LEAST_DEPTH).any():
         lens = _spherical(camera)
-        pixels = lens.img_from_cam(np.where(shown[:, None], rays, [0.0, 0.0, 1.0]))
+        pixels = np.asarray(lens.img_from_cam(np.where(shown[:, None], rays, [0.0, 0.0, 1.0])), dtype=np.float64)
     options = pycolmap.AbsolutePoseEstimationOptions()
     options.ransac.max_error = gate_px
     options.ransac.random_seed = seed

@@ -42,7 +42,9 @@ BENT = Camera("bent", 3000, 2000, 2100.0, 2100.0, 1500.0, 1000.0, (-0.13, 0.03, 
 class Draw:
     """One draw: reference keypoints and poses with new errors, the query's keypoints, its local model."""
 
-    def __init__(self, world: World, seed: int, query: Camera, references: Sequence[Camera], **options: float) -> None:
+    def __init__(
+        self, world: World, seed: int, query: Camera, references: Sequence[Camera], blunders: float = 0.0
+    ) -> None:
         rng = np.random.default_rng([seed, 5])
         self.truth, self.camera = world.queries[0], query
         self.given = [disturbed(pose, _EXACT, rng) for pose in world.references]
@@ -50,7 +52,7 @@ class Draw:
             photograph(world, pose, rng, camera=references[i % len(references)])
             for i, pose in enumerate(world.references)
         ]
-        self.seen = photograph(world, self.truth, rng, camera=query, **options)
+        self.seen = photograph(world, self.truth, rng, camera=query, blunders=blunders)
         posed = [photo.posed(pose) for photo, pose in zip(photos, self.given, strict=True)]
         self.model = query_centred_model(posed, [common(self.seen, p) for p in photos], NOISE.keypoint_sigma)
 
@@ -85,15 +87,16 @@ _KNOWN = {
 @pytest.mark.parametrize("case", _KNOWN)
 def test_covariance_of_known_cameras_holds(case: str) -> None:
     make, camera, references, (least_m, most_m) = _KNOWN[case]
-    values, errors, beyond = [], [], 0
+    values, errors, beyond, used, found = [], [], 0, 0, 0
     for seed in range(_SEEDS):
-        draw = Draw(make(seed, points=400), seed, camera, references)
+        draw = Draw(make(seed, points=500), seed, camera, references)
         estimate = draw.estimate(camera)
         assert estimate is not None
-        assert estimate.inliers.mean() > 0.97
+        used, found = used + int(estimate.inliers.sum()), found + len(estimate.inliers)
         values.append(pose_nees(draw.truth, estimate.world_from_cam, estimate.cov) / 6.0)
         errors.append(np.linalg.norm(draw.truth.local(estimate.world_from_cam)[3:]))
         beyond += int((draw.truth.inverse().apply(draw.model.points)[:, 2] < 0).sum())
+    assert used > 0.97 * found
     low, high = interval(6.0 * _SEEDS)
     assert low - 0.03 < np.mean(values) < high + 0.05, np.mean(values)
     assert least_m < np.median(errors) < most_m, np.median(errors)
@@ -146,22 +149,24 @@ def test_covariance_of_pose_and_camera_holds_where_the_camera_is_not_known(case:
     make, camera, names, (least, most) = _UNKNOWN[case]
     poses, cameras, errors, wider = [], [], [], []
     for seed in range(_SEEDS):
-        draw = Draw(make(seed, points=400), seed, camera, [CAMERA])
-        estimate, known = draw.estimate(wrong(camera, *names)), draw.estimate(camera)
+        draw = Draw(make(seed, points=300), seed, camera, [CAMERA])
+        estimate = draw.estimate(wrong(camera, *names))
         assert estimate is not None
-        assert known is not None
         assert estimate.camera.estimate == names
         error = intrinsic_errors(estimate, camera)
         poses.append(pose_nees(draw.truth, estimate.world_from_cam, estimate.cov) / 6.0)
         cameras.append(nees(error, estimate.intrinsics_cov) / len(names))
         errors.append(abs(error[0]))
-        wider.append(np.linalg.eigvalsh(estimate.cov - known.cov)[-1] / np.linalg.eigvalsh(known.cov)[-1])
+        if seed < 5:
+            known = draw.estimate(camera)
+            assert known is not None
+            wider.append(np.trace(estimate.cov[3:, 3:]) / np.trace(known.cov[3:, 3:]))
     low, high = interval(6.0 * _SEEDS)
     assert low - 0.03 < np.mean(poses) < high + 0.05, np.mean(poses)
     low, high = interval(len(names) * _SEEDS)
     assert low < np.mean(cameras) < high, np.mean(cameras)
     assert least < np.median(errors) < most, np.median(errors)
-    assert np.median(wider) > 0.0
+    assert 1.0 < np.median(wider) < 200.0, np.median(wider)
 
 
 def test_a_flat_wall_seen_square_on_leaves_focal_length_and_distance_open_and_says_so() -> None:
