@@ -23,6 +23,7 @@ from georef.errors import ConfigError, InputError
 from georef.evaluation.pose_errors import TruthSigmas
 from georef.executor import Executor
 from georef.terminal import exit_code
+from georef.types.results import Localized
 from tests.stages.bench import Bench
 from tests.worlds.tiny import EPOCH
 
@@ -120,7 +121,7 @@ def test_costs_are_those_of_the_steps_and_the_files(copied: Callable[..., Bench]
     parts = [
         row["cpu"] for step, row in local.items() if str(step).startswith("localize: ") and step != "localize: all"
     ]
-    assert local["localize: all"]["cpu"] == pytest.approx(sum(parts))
+    assert local["localize: all"]["cpu"] == pytest.approx(np.sum(np.array(parts, dtype=float)))
     storage = next(t for t in comparison.tables if t.name == "storage").rows
     features = next(row for row in storage if row["what"] == "local features")
     files = list(bench.open().feature_folder.rglob("*.safetensors"))
@@ -128,16 +129,27 @@ def test_costs_are_those_of_the_steps_and_the_files(copied: Callable[..., Bench]
     assert features["keypoints"] == 700
 
 
-def test_the_pipeline_runs_without_the_truth(copied: Callable[..., Bench], tables: Path) -> None:
-    """The same variants with no truth file anywhere give the same poses as beside it."""
+def test_the_pipeline_runs_without_the_truth(
+    finished: Bench, copied: Callable[..., Bench], tables: Path, tmp_path: Path
+) -> None:
+    """From nothing, with no truth file anywhere, it gives the poses that it gave beside one."""
     bench = copied(data=True)
-    variants = read_tables(tables, ["models"])[0].variants[:2]
     truth_of(bench).unlink()
-    source = Source(bench.data, output=bench.output)
-    blind = [Runs(source, Executor(), str).run(v).outcomes for v in variants]
-    assert all(len(outcomes) == 3 for outcomes in blind)
+    source = Source(bench.data, output=tmp_path / "fresh")
+    variants = read_tables(tables, ["models"])[0].variants[:2]
+    blind = {v.name: Runs(source, Executor(), _silent).run(v).outcomes for v in variants}
+    beside = Runs(Source(finished.data, output=finished.output), Executor(), _silent).run(variants[0]).outcomes
+    for ours, theirs in zip(blind["local"], beside, strict=True):
+        assert isinstance(ours, Localized)
+        assert isinstance(theirs, Localized)
+        assert np.array_equal(ours.world_from_cam.matrix(), theirs.world_from_cam.matrix())
+    assert all(isinstance(outcome, Localized) for outcome in blind["global"])
     with pytest.raises(InputError, match="truth"):
         compared(bench, tables, "models")
+
+
+def _silent(line: str) -> None:
+    assert line
 
 
 def test_errors_follow_the_truth_that_is_named(copied: Callable[..., Bench], tables: Path, tmp_path: Path) -> None:
