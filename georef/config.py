@@ -39,6 +39,7 @@ class FeaturesConfig(Section):
     longest_side_px: ZeroOr64 = 1024
     max_keypoints: ZeroOr16 = 0
     device: Literal["auto", "cpu", "cuda"] = "auto"
+    quantize: bool = True
 
 
 class MatchingConfig(Section):

@@ -41,7 +41,7 @@ class ExtractTask:
             return RejectReason.WRONG_SIZE.value, problem
         level, budget = self.config.longest_side_px or None, self.config.max_keypoints or None
         features = extract_features(self.extractor, pixels, level, budget)
-        FeatureStore(self.folder, extractor_version=self.version).write(feature_id(image), features, image.path)
+        _store(self.folder, self.version, self.config).write(feature_id(image), features, image.path)
         return None
 
 
@@ -51,7 +51,7 @@ def run(context: StageContext) -> StageSummary:
     uncut = cut_missing(context.survey.cutouts, context.executor)
     version = extractor_version(context.config.features)
     folder = context.before["store"]
-    store = FeatureStore(folder, extractor_version=version)
+    store = _store(folder, version, context.config.features)
     pending = [image for image in images if not store.has(feature_id(image), image.path)]
     task = ExtractTask(folder, version, context.config.features)
     failed = {
@@ -65,11 +65,16 @@ def run(context: StageContext) -> StageSummary:
     return StageSummary(line + unreadable, {"failed": failed}, len(pending) - len(failed), len(images))
 
 
+def _store(folder: Path, version: str, config: FeaturesConfig) -> FeatureStore:
+    return FeatureStore(folder, extractor_version=version, quantize=config.quantize)
+
+
 def extractor_version(config: FeaturesConfig) -> str:
     """What decides the features beside the image: the component, its weights and settings, level and budget."""
     level = f"longest side {config.longest_side_px or 'full'}"
     budget = f"at most {config.max_keypoints or 'the budget of the level'}"
-    return f"{_load_extractor(config).version()}; {level}; {budget}"
+    stored = "quantized" if config.quantize else "exact"
+    return f"{_load_extractor(config).version()}; {level}; {budget}; {stored}"
 
 
 def _load_extractor(config: FeaturesConfig) -> Extractor:
