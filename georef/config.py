@@ -58,6 +58,7 @@ class CandidatesConfig(Section):
     min_half_side_m: float = Field(default=15.0, gt=0)
     viewing_reach_m: float = Field(default=30.0, gt=0)
     half_side_m: float = Field(default=100.0, gt=0)
+    unstated_half_side_m: float = Field(default=500.0, gt=0)
     heading_window_deg: float = Field(default=90.0, gt=0, le=180)
     epochs: list[str] = []
     ranking: Literal["global-votes", "global", "votes"] = "global-votes"

@@ -30,8 +30,12 @@ class Box:
     half_side_m: float | None = None
 
 
-def search_box(positions: Array, prior: PositionPrior | None, config: CandidatesConfig) -> Box:
+def search_box(
+    positions: Array, prior: PositionPrior | None, config: CandidatesConfig, near: Array | None = None
+) -> Box:
     """References (of positions (N, 3)) inside a square box about a position prior; widened until there are enough.
+
+    near: (3,) the position to search about where there is no prior, one whose sigma nobody states.
 
     Half the side is the stated uncertainty ("published"), max(min_half_side, 3 sigma + viewing reach) ("reach"), or
     half_side_m ("fixed"); "none" takes the whole reference, as an image without a prior does. References whose
@@ -40,9 +44,10 @@ def search_box(positions: Array, prior: PositionPrior | None, config: Candidates
     everything = np.flatnonzero(np.isfinite(positions[:, :2]).all(axis=1))
     if config.box == "none":
         return Box(everything, True)
-    if prior is None:
+    centre = near if prior is None else prior.position_in_world
+    if centre is None:
         return Box(everything, True, "no position prior: searched the whole reference")
-    offset = np.abs(positions[:, :2] - prior.position_in_world[:2]).max(axis=1)
+    offset = np.abs(positions[:, :2] - centre[:2]).max(axis=1)
     asked = _half_side(prior, config)
     half_side, needed = asked, min(config.count, int(np.isfinite(offset).sum()))
     while np.count_nonzero(offset <= half_side) < needed:
@@ -53,13 +58,15 @@ def search_box(positions: Array, prior: PositionPrior | None, config: Candidates
         found = np.count_nonzero(offset <= asked)
         note = f"search box widened from {asked:.1f} to {half_side:.1f} m half side: {found} of {needed} references"
     order = np.argsort(offset[inside], kind="stable")
-    return Box(inside[order], len(inside) == len(everything), note, prior.position_in_world, half_side)
+    return Box(inside[order], len(inside) == len(everything), note, centre, half_side)
 
 
-def _half_side(prior: PositionPrior, config: CandidatesConfig) -> float:
-    sigma = float(np.sqrt(np.linalg.eigvalsh(prior.cov[:2, :2])[-1]))
+def _half_side(prior: PositionPrior | None, config: CandidatesConfig) -> float:
     if config.box == "fixed":
         return config.half_side_m
+    if prior is None:
+        return config.unstated_half_side_m
+    sigma = float(np.sqrt(np.linalg.eigvalsh(prior.cov[:2, :2])[-1]))
     if config.box == "published":
         return sigma
     return max(config.min_half_side_m, 3.0 * sigma + config.viewing_reach_m)

@@ -46,7 +46,7 @@ def localize_image(
         return Rejected(image.image_id, RejectReason.FEW_FEATURES, f"{len(features)} keypoints")
     search = Search(reference, features, image.heading_rad, candidates, find_similar)
     query = Query(image, features, reference, matcher, config, match_keypoints, search)
-    box = search_box(search.positions, image.gnss, candidates)
+    box = search_box(search.positions, image.gnss, candidates, image.near)
     outcome = _localize_in(query, box)
     if isinstance(outcome, Rejected) and not box.whole_reference:
         query.notes.append(

@@ -1,4 +1,4 @@
-"""The two ways to compare with: points that COLMAP triangulates about a query, or those of a precomputed map; then PnP."""
+"""Two ways to compare with: points that COLMAP triangulates about a query, or those of a precomputed map; then PnP."""
 
 from __future__ import annotations
 

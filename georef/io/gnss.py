@@ -1,4 +1,4 @@
-"""Positions of images by GNSS, with their standard deviations and, where there is one, a heading."""
+"""Positions of images by GNSS, with their standard deviations and, where there are any, headings."""
 
 from __future__ import annotations
 
@@ -22,9 +22,14 @@ class GnssTable(PositionTable):
     """
 
     image_ids: tuple[str, ...]
-    sigmas_m: Array  # (N, 3) m along the axes of the CRS (geographic: east, north, up)
+    sigmas_m: Array  # (N, 3) m along the axes of the CRS (geographic: east, north, up), NaN where none is stated
     heading_deg: Array  # (N,)
     cameras: tuple[str, ...]
+
+    @property
+    def unstated(self) -> bool:
+        """Whether the file has no sigmas at all."""
+        return bool(np.isnan(self.sigmas_m).all())
 
 
 def read_gnss(
@@ -36,11 +41,13 @@ def read_gnss(
 ) -> GnssTable:
     """Read image, position, three sigmas (m) and optionally heading_deg and camera.
 
-    Raises InputError for columns that are missing, values that cannot be, sigmas that are not positive, and images
+    A file may be without any column of sigmas; some of them alone are refused. Raises InputError for columns that are
+    missing, values that cannot be, sigmas that are not positive, and images
     that are listed twice.
     """
     table = read_table(path, columns=columns, table_format=table_format)
-    require_columns(table, crs_kind, ("image", *SIGMA_COLUMNS[crs_kind]))
+    stated = any(table.has(name) for name in SIGMA_COLUMNS[crs_kind])
+    require_columns(table, crs_kind, ("image", *(SIGMA_COLUMNS[crs_kind] if stated else ())))
     image_ids = table.unique_ids("image")
     return GnssTable(
         path=table.path,
@@ -48,15 +55,19 @@ def read_gnss(
         rows=table.rows,
         positions_in_crs=read_positions(table, crs_kind),
         image_ids=image_ids,
-        sigmas_m=read_sigmas(
-            table,
-            SIGMA_COLUMNS[crs_kind],
-            lambda i: f"The position of image {image_ids[i]!r}",
-            expected="a positive standard deviation in metres (RTK: 0.02 to 0.05; single receiver: 1 to 5).",
-            remedy=lambda _: "Correct the value, or delete the row if the image has no GNSS position.",
-        ),
+        sigmas_m=_sigmas(table, crs_kind, image_ids) if stated else np.full((len(table), 3), np.nan),
         heading_deg=_headings(table),
         cameras=table.text("camera") if table.has("camera") else ("",) * len(table),
+    )
+
+
+def _sigmas(table: Table, crs_kind: CrsKind, image_ids: tuple[str, ...]) -> Array:
+    return read_sigmas(
+        table,
+        SIGMA_COLUMNS[crs_kind],
+        lambda i: f"The position of image {image_ids[i]!r}",
+        expected="a positive standard deviation in metres (RTK: 0.02 to 0.05; single receiver: 1 to 5).",
+        remedy=lambda _: "Correct the value, or delete the row if the image has no GNSS position.",
     )
 
 

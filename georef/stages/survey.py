@@ -6,7 +6,7 @@ import logging
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
 
@@ -95,7 +95,10 @@ def _epoch(
         )
         check_frame(gnss, definition)
         stated = Stated.of(gnss.path, gnss.image_ids, gnss.cameras, gnss.rows.tolist())
-        priors = dict(zip(gnss.image_ids, _priors(gnss, world), strict=True))
+        priors = dict(zip(gnss.image_ids, _measured(gnss, world), strict=True))
+        if gnss.unstated:
+            message = "%s states no sigmas: its positions are searched about, and are no observations"
+            logger.warning(message, gnss.path)
         files |= {name: folder / name for name in gnss.image_ids if name not in files}
         without = [name for name in files if name not in priors]
         if without:
@@ -107,8 +110,7 @@ def _epoch(
         image = placeholder(name, path, epoch)
         if section.panorama is None:
             image = replace(image, camera=_new_camera(name, path, table, stated, section.unknown))
-        prior, heading_rad = priors.get(name, (None, None))
-        images.append(replace(image, gnss=prior, heading_rad=heading_rad))
+        images.append(replace(image, **priors.get(name, {})))
     return with_heads(project, epoch, images, section.panorama)
 
 
@@ -119,18 +121,18 @@ def _new_camera(name: str, path: Path, table: CameraTable | None, stated: Stated
     return with_unknown(table.camera_of(name, stated), unknown, path)
 
 
-def _priors(gnss: GnssTable, world: WorldFrame) -> list[tuple[PositionPrior, float | None]]:
-    """Position and heading (rad, None where there is none) of each row."""
+def _measured(gnss: GnssTable, world: WorldFrame) -> list[dict[str, Any]]:
+    """What each row says of its image: its position with a covariance, or one to search about; its heading (rad)."""
+    positions = world.world_from_crs(gnss.positions_in_crs)
+    said: list[dict[str, Any]] = [
+        {"heading_rad": None if np.isnan(heading) else float(np.radians(heading))} for heading in gnss.heading_deg
+    ]
+    if gnss.unstated:
+        return [row | {"near": position} for row, position in zip(said, positions, strict=True)]
     covs = np.zeros((len(gnss), 3, 3))
     covs[:, range(3), range(3)] = np.square(gnss.sigmas_m)
-    positions = world.world_from_crs(gnss.positions_in_crs)
-    headings = [None if np.isnan(heading) else float(np.radians(heading)) for heading in gnss.heading_deg]
-    return [
-        (PositionPrior(p, c), heading)
-        for p, c, heading in zip(
-            positions, world.world_cov_from_crs(gnss.positions_in_crs, covs), headings, strict=True
-        )
-    ]
+    covs = world.world_cov_from_crs(gnss.positions_in_crs, covs)
+    return [row | {"gnss": PositionPrior(p, c)} for row, p, c in zip(said, positions, covs, strict=True)]
 
 
 def _points(

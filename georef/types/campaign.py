@@ -51,6 +51,9 @@ class Image:
     epoch: str
     world_from_cam: Rigid3 | None = None  # reference images: the given exterior orientation
     gnss: PositionPrior | None = None
+    near: Array | None = (
+        None  # (3,) m, a position that nobody states a sigma for: a place to search about, no observation
+    )
     heading_rad: float | None = None  # of the optical axis, clockwise from the world's north
     given_sigma: PoseSigma | None = None  # of world_from_cam, where the project declares it
 

@@ -93,7 +93,9 @@ def localized(
     image = new_image("q", camera=thought)
     config = LocalizeConfig(method=method)  # pyright: ignore[reportArgumentType]
     reference = reference_map(seen, given, exact)
-    outcome = localize_image(image, query.features, reference, MutualNearest(), CandidatesConfig(ranking="votes"), config, 2048)
+    outcome = localize_image(
+        image, query.features, reference, MutualNearest(), CandidatesConfig(ranking="votes"), config, 2048
+    )
     if isinstance(outcome, Rejected):
         return outcome, np.nan
     return outcome, pose_nees(query.truth, outcome.world_from_cam, outcome.world_from_cam_cov)

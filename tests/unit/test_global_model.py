@@ -64,7 +64,9 @@ def mapped(
 
 def localized(reference: ReferenceMap, query: Seen) -> Localized:
     image = new_image("q", query.truth.translation + np.array([1.0, -1.5, 2.0]))
-    outcome = localize_image(image, query.features, reference, MutualNearest(), CandidatesConfig(ranking="votes"), CONFIG, 2048)
+    outcome = localize_image(
+        image, query.features, reference, MutualNearest(), CandidatesConfig(ranking="votes"), CONFIG, 2048
+    )
     assert isinstance(outcome, Localized), outcome
     return outcome
 
