@@ -148,6 +148,6 @@ def _kornias_detector() -> Detect:
 
 
 def _same_share(own: np.ndarray, shipped: np.ndarray) -> float:
-    from scipy.spatial import cKDTree
+    from scipy.spatial import KDTree
 
-    return float(np.mean(cKDTree(own).query(shipped)[0] < _SAME_PX))
+    return float(np.mean(KDTree(own).query(shipped)[0] < _SAME_PX))

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from georef.features.detections import Detections, Image
 
@@ -74,7 +74,7 @@ def _seen_once(keypoints_px: NDArray[np.float32], tile_of: NDArray[np.integer]) 
     """Which keypoints (N, 2), the best first, stay: no better one of another tile lies within `NMS_PX`."""
     stay = np.ones(len(keypoints_px), np.bool_)
     pairs = (
-        cKDTree(keypoints_px).query_pairs(NMS_PX, output_type="ndarray") if len(keypoints_px) else np.zeros((0, 2), int)
+        KDTree(keypoints_px).query_pairs(NMS_PX, output_type="ndarray") if len(keypoints_px) else np.zeros((0, 2), int)
     )
     pairs = pairs[tile_of[pairs[:, 0]] != tile_of[pairs[:, 1]]]
     for better, worse in sorted(map(tuple, np.sort(pairs, axis=1).tolist())):

@@ -35,8 +35,8 @@ class Maker:
 
     def normal(self, name: str, *shape: int, scale: float | None = None) -> None:
         fan_in = max(1, torch.Size(shape[1:]).numel())
-        scale = (2 / fan_in) ** 0.5 if scale is None else scale
-        self.made[name] = scale * torch.randn(shape, generator=self._generator)
+        spread = (2 / fan_in) ** 0.5 if scale is None else scale
+        self.made[name] = spread * torch.randn(shape, generator=self._generator)
 
     def conv(self, name: str, out: int, inner: int, size: int, *, bias: bool) -> None:
         self.normal(f"{name}.weight", out, inner, size, size)
