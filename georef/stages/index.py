@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from georef.config import CandidatesConfig, Config, RetrievalConfig
+from georef.config import CandidatesConfig, Config
 from georef.estimation.candidates import Box
 from georef.estimation.search import FindSimilar
 from georef.features.globals.base import GlobalDescriptor, Needs, Row
@@ -34,20 +34,21 @@ def run(context: StageContext) -> StageSummary:
     """Learns the global descriptor where it must be learned, and describes what is not yet in the database."""
     failed = failed_images(context.before["features"])
     images = [image for image in context.survey.reference.images if feature_id(image) not in failed]
-    task = DescribeTask(context.config.retrieval, context.before["store"], context.folder / STATE)
+    task = DescribeTask(context.config, context.before["store"], context.folder / STATE)
     task.learn(images)
     vectors = open_vectors(context.folder, task.descriptor)
     there = vectors.keys()
     pending = [image for image in images if feature_id(image) not in there]
     vectors.upsert(_rows(pending, context.executor.map_items(task, pending, "index")))
     vectors.optimize()
-    line = f"{len(vectors)} of {len(images)} reference images in the vector database, by {task.config.descriptor}"
+    name = task.config.retrieval.descriptor
+    line = f"{len(vectors)} of {len(images)} reference images in the vector database, by {name}"
     return StageSummary(line, {"indexed": len(vectors)}, len(pending), len(images))
 
 
 def descriptor_version(config: Config) -> str:
     """What decides the descriptors beside the images and what is learned from them."""
-    return _made(config.retrieval).version()
+    return _made(config).version()
 
 
 def open_vectors(folder: Path, descriptor: GlobalDescriptor) -> VectorIndex:
@@ -59,7 +60,7 @@ def open_vectors(folder: Path, descriptor: GlobalDescriptor) -> VectorIndex:
 class DescribeTask:
     """Describes one image; None where it can no longer be read."""
 
-    config: RetrievalConfig
+    config: Config
     store_folder: Path
     state_path: Path
 
@@ -140,7 +141,7 @@ class SimilarImages:
 
 def open_index(folder: Path, store_folder: Path, config: Config, references: Iterable[Image]) -> SimilarImages:
     """The vector database of a finished stage, for the references of a map in their order."""
-    task = DescribeTask(config.retrieval, store_folder, folder / STATE)
+    task = DescribeTask(config, store_folder, folder / STATE)
     rows = {feature_id(image): row for row, image in enumerate(references)}
     return SimilarImages(task, open_vectors(folder, task.descriptor), rows)
 
@@ -154,8 +155,9 @@ def _rows(images: Sequence[Image], described: Iterable[Row | None]) -> Iterator[
             yield IndexRow(feature_id(image), pose.translation, heading, image.epoch, image.camera.camera_id, row)
 
 
-def _made(config: RetrievalConfig) -> Any:
-    return load_component(GLOBAL_DESCRIPTORS, config.descriptor, **config.options)
+def _made(config: Config) -> Any:
+    options = {"device": config.features.device, **config.retrieval.options}
+    return load_component(GLOBAL_DESCRIPTORS, config.retrieval.descriptor, **options)
 
 
 def _learns(descriptor: GlobalDescriptor) -> bool:

@@ -68,7 +68,7 @@ class LocalizeTask:
 
     @cached_property
     def matcher(self) -> Matcher:
-        return load_component(MATCHERS, self.config.matching.matcher, **self.config.matching.options)
+        return _matcher(self.config)
 
     def __call__(self, image: Image) -> Outcome:
         failure = self.failed.get(feature_id(image))
@@ -145,7 +145,7 @@ def _summary(outcomes: list[Outcome], computed: int) -> StageSummary:
 
 def matcher_version(config: Config) -> str:
     """The matcher's version. Raises ConfigError where it does not fit the features."""
-    matcher = load_component(MATCHERS, config.matching.matcher, **config.matching.options)
+    matcher = _matcher(config)
     fitting = getattr(matcher, "extractors", None)  # None: any
     if fitting is not None and config.features.extractor not in fitting:
         raise ConfigError(
@@ -154,3 +154,8 @@ def matcher_version(config: Config) -> str:
             "Choose another with --set matching.matcher=mutual-nn, or a preset such as sift.",
         )
     return matcher.version()
+
+
+def _matcher(config: Config) -> Matcher:
+    options = {"device": config.features.device, **config.matching.options}
+    return load_component(MATCHERS, config.matching.matcher, **options)

@@ -18,7 +18,7 @@ from tests.worlds.tiny import EPOCH
 
 def task_of(bench: Bench) -> tuple[DescribeTask, Path]:
     project, folder = bench.open(), bench.states()["index"].folder
-    return DescribeTask(project.config.retrieval, next(project.feature_folder.iterdir()), folder / STATE), folder
+    return DescribeTask(project.config, next(project.feature_folder.iterdir()), folder / STATE), folder
 
 
 def test_all_references_are_in_the_database_where_they_are(finished: Bench) -> None:

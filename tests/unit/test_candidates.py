@@ -143,3 +143,13 @@ def test_overlap_counts_points_inside_the_image_from_a_similar_side() -> None:
     pixel = views.project(np.full(len(rays), 2), world.points)
     inside = ((pixel >= 0) & (pixel <= [CAMERA.width, CAMERA.height])).all(axis=1)
     assert counts[2] < 0.1 * inside.sum()  # it sees them from the other side
+
+
+def test_a_position_without_sigma_is_searched_about() -> None:
+    near = np.array([100.0, 50.0, 0.0])
+    for options in ({}, {"box": "published"}):
+        config = CandidatesConfig.model_validate({"count": 2, **options})
+        box = search_box(line_of_positions(90.0), None, config, near)
+        assert (len(box.indices), box.half_side_m, box.whole_reference) == (11, 500.0, False)
+    box = search_box(line_of_positions(90.0), prior(1.0), CandidatesConfig(box="published", count=2), near + 90.0)
+    np.testing.assert_array_equal(box.centre, [100.0, 50.0, 3.0])  # a prior goes before it

@@ -215,3 +215,15 @@ def test_surveyed_points_of_another_program(data: Path) -> None:
     first = table.image_ids.index("GCP02")
     np.testing.assert_array_equal(table.positions_in_crs[first], [717429.126, 1606454.237, 3.4845])
     np.testing.assert_array_equal(table.sigmas_m[first], [0.02, 0.02, 0.05])
+
+
+def test_gnss_without_any_sigma_has_none(tmp_path: Path) -> None:
+    table = read_gnss(written(tmp_path, "image,x,y,z\na,1,2,3\nb,4,5,6\n"), crs_kind="local")
+    assert table.unstated
+    assert np.isnan(table.sigmas_m).all()
+
+
+@pytest.mark.parametrize("header", ["image,x,y,z,sigma_x", "image,x,y,z,Sigma_East"])
+def test_some_sigmas_alone_are_refused(tmp_path: Path, header: str) -> None:
+    with pytest.raises(InputError, match="has no column 'sigma_[xy]'"):
+        read_gnss(written(tmp_path, f"{header}\na,1,2,3,0.1\n"), crs_kind="local")
