@@ -29,8 +29,9 @@ def read_cameras(
 
     Pixels; the centre of the top-left pixel is (0.5, 0.5). model: pinhole, brown (k1, k2, p1, p2, k3) or fisheye
     (equidistant, k1 to k4); without it brown where a coefficient is not zero, pinhole elsewhere. estimate: which of
-    focal, k1, k2 are not known, "focal k1"; their values are then where the estimation starts, and may be left out
-    together with the principal point: 1.2 of the longer side, the middle. Raises InputError for columns that are
+    focal, k1, k2, cx, cy, aspect (fy / fx) are not known, "focal k1"; their values are then where the estimation
+    starts. An unknown focal length may be left out (it starts at 1.2 of the longer side), and with it the principal
+    point, which is then estimated as well. Raises InputError for columns that are
     missing, values that cannot be (sizes, focal lengths, a principal point outside the image), coefficients that the
     model does not have, and cameras that are listed twice.
     """
@@ -94,11 +95,14 @@ def _unknown(table: Table) -> list[tuple[str, ...]]:
     for i, cell in enumerate(table.text("estimate")):
         names = tuple(cell.lower().replace("+", " ").replace(";", " ").split())
         wrong = [name for name in names if name not in ESTIMABLE]
+        blank = [name for name in ("cx", "cy") if not table.has(name) or not table.text(name)[i]]
+        if "focal" in names:  # nothing is known of a principal point that is left out
+            names += tuple(name for name in blank if name not in names)
         if wrong or len(set(names)) < len(names) or ("k2" in names and "k1" not in names):
             raise table.error(
                 i,
                 f"Column 'estimate' has {cell!r}.",
-                expected='what is not known of the camera: "focal", "focal k1", "focal k1 k2", "k1", or nothing.',
+                expected='what is not known: "focal", "focal k1", "focal k1 k2", "focal cx cy", or nothing.',
                 remedy="Correct the value; leave it empty for a camera that is calibrated.",
             )
         out.append(names)
