@@ -30,8 +30,8 @@ def read_cameras(
     Pixels; the centre of the top-left pixel is (0.5, 0.5). model: pinhole, brown (k1, k2, p1, p2, k3) or fisheye
     (equidistant, k1 to k4); without it brown where a coefficient is not zero, pinhole elsewhere. estimate: which of
     focal, k1, k2, cx, cy, aspect (fy / fx) are not known, "focal k1"; their values are then where the estimation
-    starts. An unknown focal length may be left out (it starts at 1.2 of the longer side), and with it the principal
-    point, which is then estimated as well. Raises InputError for columns that are
+    starts. Of a camera of unknown focal length fx, fy (they start at 1.2 of the longer side) and the principal point may
+    be left out: what is, is estimated. Raises InputError for columns that are
     missing, values that cannot be (sizes, focal lengths, a principal point outside the image), coefficients that the
     model does not have, and cameras that are listed twice.
     """
@@ -95,9 +95,9 @@ def _unknown(table: Table) -> list[tuple[str, ...]]:
     for i, cell in enumerate(table.text("estimate")):
         names = tuple(cell.lower().replace("+", " ").replace(";", " ").split())
         wrong = [name for name in names if name not in ESTIMABLE]
-        blank = [name for name in ("cx", "cy") if not table.has(name) or not table.text(name)[i]]
-        if "focal" in names:  # nothing is known of a principal point that is left out
-            names += tuple(name for name in blank if name not in names)
+        if "focal" in names:  # nothing is known of what is left out
+            blank = [n for n in ("cx", "cy", "fy") if not table.has(n) or not table.text(n)[i]]
+            names += tuple(n for n in ("aspect" if n == "fy" else n for n in blank) if n not in names)
         if wrong or len(set(names)) < len(names) or ("k2" in names and "k1" not in names):
             raise table.error(
                 i,

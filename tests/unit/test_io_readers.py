@@ -143,7 +143,7 @@ def test_named_camera_models(tmp_path: Path) -> None:
 def test_cameras_that_are_not_known(tmp_path: Path) -> None:
     rows = "a,80,60,,,,,focal\nb,80,60,90,91,41,31,focal+k1\nc,80,60,70,71,41,31,\n"
     cameras = read_cameras(written(tmp_path, "camera,width,height,fx,fy,cx,cy,estimate\n" + rows))
-    assert cameras["a"] == Camera("a", 80, 60, 96.0, 96.0, 40.0, 30.0, estimate=("focal", "cx", "cy"))
+    assert cameras["a"] == Camera("a", 80, 60, 96.0, 96.0, 40.0, 30.0, estimate=("focal", "cx", "cy", "aspect"))
     assert cameras["b"] == Camera("b", 80, 60, 90.0, 91.0, 41.0, 31.0, (0.0,) * 4, "brown", ("focal", "k1"))
     assert cameras["c"].estimate == ()
     only = read_cameras(written(tmp_path, "camera,width,height,estimate\na,60,80,focal\n"))
