@@ -31,8 +31,9 @@ def read_cameras(
     (equidistant, k1 to k4); without it brown where a coefficient is not zero, pinhole elsewhere. estimate: which of
     focal, k1, k2, cx, cy, aspect (fy / fx) are not known, "focal k1"; their values are then where the estimation
     starts. Of a camera of unknown focal length fx, fy (they start at 1.2 of the longer side) and the principal point
-    may be left out: what is, is estimated. Raises InputError for columns that are missing, values that cannot be (sizes, focal lengths, a principal point outside the image), coefficients that the
-    model does not have, and cameras that are listed twice.
+    may be left out: what is, is estimated. Raises InputError for columns that are missing, values that cannot be
+    (sizes, focal lengths, a principal point outside the image), coefficients that the model does not have, and cameras
+    that are listed twice.
     """
     table = read_table(path, columns=columns, table_format=table_format)
     unknown = _unknown(table)
