@@ -17,7 +17,7 @@ from georef.errors import ConfigError
 PROJECT_FILE = "project.toml"
 AngleConvention = Literal["omega-phi-kappa", "yaw-pitch-roll"]
 AngleUnit = Literal["deg", "gon", "rad"]
-Unknown = Literal["focal", "k1", "k2"]
+Unknown = Literal["focal", "k1", "k2", "cx", "cy", "aspect"]
 REFERENCE = "reference"  # the name of the only reference epoch of a project
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]*")
 
@@ -80,7 +80,10 @@ class ReferenceSection(Section):
 
 
 class EpochSection(Section):
-    """intrinsics: what is not known of the cameras; "estimate" is the focal length and k1."""
+    """intrinsics: what is not known of the cameras; "estimate" is the focal length, the principal point and k1.
+
+    A principal point that is held where it is not makes poses wrong by more than they state.
+    """
 
     images: str
     cameras: str | None = None
@@ -105,15 +108,16 @@ class EpochSection(Section):
     def _possible(cls, value: Any) -> Any:
         names = (value,) if isinstance(value, str) else value or ()
         if value != "estimate" and set(names) - set(get_args(Unknown)):
-            raise ValueError('expected "estimate", or a list of "focal", "k1", "k2"')
+            known = ", ".join(f'"{name}"' for name in get_args(Unknown))
+            raise ValueError(f'expected "estimate", or a list of {known}')
         if len(set(names)) < len(names) or {"k1", "k2"} & set(names) == {"k2"}:
-            raise ValueError('each of "focal", "k1", "k2" at most once, and k2 only together with k1')
+            raise ValueError("each of the intrinsics at most once, and k2 only together with k1")
         return value
 
     @property
     def unknown(self) -> tuple[Unknown, ...]:
         """Which intrinsics are to be estimated of every image of the epoch."""
-        given = ("focal", "k1") if self.intrinsics == "estimate" else self.intrinsics or ()
+        given = ("focal", "k1", "cx", "cy") if self.intrinsics == "estimate" else self.intrinsics or ()
         names = (given,) if isinstance(given, str) else given
         return tuple(name for name in get_args(Unknown) if name in names)
 

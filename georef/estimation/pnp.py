@@ -38,7 +38,7 @@ class EstimatedPose:
     inliers: NDArray[np.bool_]  # (P,) of the local model's points
     sigma0: float  # a-posteriori over a-priori standard deviation of an observation
     camera: Camera  # as estimated; the given one where it is known
-    intrinsics_cov: Array  # (q, q) of camera.estimate, focal as its logarithm; (0, 0) where the camera is known
+    intrinsics_cov: Array  # (q, q) of steps of camera.estimate; (0, 0) where the camera is known
 
 
 def refine_pose(

@@ -20,8 +20,9 @@ from georef.geometry.lenses import COEFFICIENTS, MODELS, LensModel, undistort
 from georef.geometry.rigid import Array
 
 CameraModel = Literal["pinhole", "brown", "fisheye"]
-ESTIMABLE = ("focal", "k1", "k2")
-"""What can be estimated of a camera together with a pose. focal is the logarithm of a factor on fx and fy."""
+ESTIMABLE = ("focal", "k1", "k2", "cx", "cy", "aspect")
+"""What can be estimated of a camera together with a pose, all without unit: steps of focal are those of the logarithm
+of a factor on fx and fy, of aspect on fy alone, steps of cx and cy are in units of fx."""
 
 
 @dataclass(frozen=True)
@@ -90,22 +91,24 @@ class Camera:
         return float(np.arctan2(np.linalg.norm(rays[:, :2], axis=1), rays[:, 2]).max())
 
     def value(self, name: str) -> float:
-        """The value of one of ESTIMABLE; focal is fx in pixels."""
-        return self.fx if name == "focal" else float(self.coefficients[self.lens.parameters.index(name)])
+        """The value of one of ESTIMABLE; focal is fx in pixels, aspect fy / fx."""
+        plain = {"focal": self.fx, "cx": self.cx, "cy": self.cy, "aspect": self.fy / self.fx}
+        return plain[name] if name in plain else float(self.coefficients[self.lens.parameters.index(name)])
+
+    def unit(self, name: str) -> float:
+        """What a step of one of ESTIMABLE changes its value by."""
+        return {"focal": self.fx, "cx": self.fx, "cy": self.fx, "aspect": self.fy / self.fx}.get(name, 1.0)
 
     def changed(self, names: Sequence[str], step: ArrayLike) -> Camera:
         """The camera with a step (q,) added to the named ones of ESTIMABLE."""
-        factor, coefficients = 1.0, self.coefficients
-        for name, change in zip(names, np.asarray(step, dtype=np.float64), strict=True):
-            if name == "focal":
-                factor = float(np.exp(change))
-            else:
-                coefficients[self.lens.parameters.index(name)] += change
-        count = len(self.distortion)
-        if any(name != "focal" for name in names):
-            count = max(count, 4)
+        steps = dict(zip(names, (float(v) for v in np.asarray(step, dtype=np.float64)), strict=True))
+        factor, stretch = (float(np.exp(steps.pop(name, 0.0))) for name in ("focal", "aspect"))
+        cx, cy = self.cx + self.fx * steps.pop("cx", 0.0), self.cy + self.fx * steps.pop("cy", 0.0)
+        coefficients, count = self.coefficients, max(len(self.distortion), 4 if steps else 0)
+        for name, change in steps.items():
+            coefficients[self.lens.parameters.index(name)] += change
         distortion = tuple(float(v) for v in coefficients[:count])
-        return replace(self, fx=self.fx * factor, fy=self.fy * factor, distortion=distortion)
+        return replace(self, fx=self.fx * factor, fy=self.fy * factor * stretch, cx=cx, cy=cy, distortion=distortion)
 
 
 def project(camera: Camera, points_in_cam: ArrayLike) -> Array:
@@ -144,8 +147,14 @@ def intrinsic_derivatives(camera: Camera, points_in_cam: Array, names: Sequence[
     """Derivatives (N, 2, q) of the pixels of points (N, 3) by q named ones of ESTIMABLE."""
     image, _, by_coefficient = camera.lens.derivatives(points_in_cam, camera.coefficients, np.asarray(camera.limit))
     focal = np.array([camera.fx, camera.fy])
+    plain = {
+        "focal": image * focal,
+        "aspect": image * [0.0, camera.fy],
+        "cx": np.broadcast_to([camera.fx, 0.0], image.shape),
+        "cy": np.broadcast_to([0.0, camera.fx], image.shape),
+    }
     columns = [
-        image * focal if name == "focal" else by_coefficient[..., camera.lens.parameters.index(name)] * focal
+        plain[name] if name in plain else by_coefficient[..., camera.lens.parameters.index(name)] * focal
         for name in names
     ]
     return np.stack(columns, axis=-1) if columns else np.zeros((len(points_in_cam), 2, 0))

@@ -22,6 +22,7 @@ COEFFICIENTS = 5
 _UNDISTORT_ITERATIONS, _UNDISTORTED = 12, 1e-15
 _SMALLEST_DETERMINANT, _LARGEST_STEP = 1e-3, 0.5  # of Newton's method
 _BISECTIONS, _ON_AXIS = 60, 1e-9
+_NEGLIGIBLE = 1e-12  # coefficients that bend nothing, and would overflow where roots are looked for
 _WIDEST_RAD = float(np.pi - 1e-3)  # straight behind, a direction has no single pixel
 
 
@@ -38,6 +39,7 @@ class LensModel:
 
 def first_turning_point(rate: Array) -> float:
     """Smallest positive x at which 1 + rate[0] x^2 + rate[1] x^4 + ... is zero; infinite where it is nowhere."""
+    rate = np.where(np.abs(rate) > _NEGLIGIBLE, rate, 0.0)
     roots = np.roots([*rate[::-1], 1.0]) if np.any(rate) else np.zeros(0)
     real = roots.real[(np.abs(roots.imag) < 1e-9 * np.maximum(1.0, np.abs(roots.real))) & (roots.real > 0)]
     return float(np.sqrt(real.min())) if len(real) else np.inf

@@ -29,10 +29,11 @@ def read_cameras(
 
     Pixels; the centre of the top-left pixel is (0.5, 0.5). model: pinhole, brown (k1, k2, p1, p2, k3) or fisheye
     (equidistant, k1 to k4); without it brown where a coefficient is not zero, pinhole elsewhere. estimate: which of
-    focal, k1, k2 are not known, "focal k1"; their values are then where the estimation starts, and may be left out
-    together with the principal point: 1.2 of the longer side, the middle. Raises InputError for columns that are
-    missing, values that cannot be (sizes, focal lengths, a principal point outside the image), coefficients that the
-    model does not have, and cameras that are listed twice.
+    focal, k1, k2, cx, cy, aspect (fy / fx) are not known, "focal k1"; their values are then where the estimation
+    starts. Of a camera of unknown focal length fx, fy (they start at 1.2 of the longer side) and the principal point
+    may be left out: what is, is estimated. Raises InputError for columns that are missing, values that cannot be
+    (sizes, focal lengths, a principal point outside the image), coefficients that the model does not have, and cameras
+    that are listed twice.
     """
     table = read_table(path, columns=columns, table_format=table_format)
     unknown = _unknown(table)
@@ -94,11 +95,14 @@ def _unknown(table: Table) -> list[tuple[str, ...]]:
     for i, cell in enumerate(table.text("estimate")):
         names = tuple(cell.lower().replace("+", " ").replace(";", " ").split())
         wrong = [name for name in names if name not in ESTIMABLE]
+        if "focal" in names:  # nothing is known of what is left out
+            blank = [n for n in ("cx", "cy", "fy") if not table.has(n) or not table.text(n)[i]]
+            names += tuple(n for n in ("aspect" if n == "fy" else n for n in blank) if n not in names)
         if wrong or len(set(names)) < len(names) or ("k2" in names and "k1" not in names):
             raise table.error(
                 i,
                 f"Column 'estimate' has {cell!r}.",
-                expected='what is not known of the camera: "focal", "focal k1", "focal k1 k2", "k1", or nothing.',
+                expected='what is not known: "focal", "focal k1", "focal k1 k2", "focal cx cy", or nothing.',
                 remedy="Correct the value; leave it empty for a camera that is calibrated.",
             )
         out.append(names)

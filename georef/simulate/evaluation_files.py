@@ -196,7 +196,7 @@ _PANORAMA = (
     f'panorama = {{{{ projection = "{{projection}}", heads = "{HEADS}", '
     f"stitching_radius_m = {STITCHING_RADIUS_M} }}}}\n"
 )
-_UNKNOWN = 'intrinsics = ["focal", "k1"]     # unknown; the estimation starts from the focal length in EXIF\n'
+_UNKNOWN = 'intrinsics = "estimate"        # unknown: focal length (starts from EXIF), principal point and k1\n'
 _HEADER = """\
 # A simulated street for evaluations: two reference epochs, mapped by three cameras and by panoramas, and new images of
 # many kinds. Positions are good to 15 m; tables that end in _100m.csv hold weaker ones:

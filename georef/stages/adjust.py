@@ -187,5 +187,5 @@ def _line(data: dict[str, Any]) -> str:
     return (
         f"{data['images']} images, {data['automatic_gcps']} automatic GCPs, {data['tie_points']} tie points, "
         f"{data['image_observations']} observations ({gate['rejected']} rejected), "
-        f"sigma0 {scale:.2f}" + ("" if data["converged"] else ", NOT CONVERGED")
+        f"sigma0 {'-' if scale is None else f'{scale:.2f}'}" + ("" if data["converged"] else ", NOT CONVERGED")
     )

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from georef.errors import InputError
-from georef.geometry.camera import Camera
+from georef.geometry.camera import ESTIMABLE, Camera
 from georef.io.camera_table import DEFAULT_FOCAL, read_cameras
 from georef.io.exif import image_size, size_and_focal
 
@@ -109,7 +109,7 @@ def with_unknown(camera: Camera, unknown: tuple[str, ...], path: Path) -> Camera
 
     Where the table says no focal length, EXIF does, if it can.
     """
-    names = tuple(name for name in ("focal", "k1", "k2") if name in {*camera.estimate, *unknown})
+    names = tuple(name for name in ESTIMABLE if name in {*camera.estimate, *unknown})
     if not names:
         return camera
     started = replace(camera, estimate=names)

@@ -56,17 +56,17 @@ class Localized:
     notes: tuple[str, ...] = ()
     cpu_s: dict[str, float] = field(default_factory=dict)
     camera: Camera | None = None  # as estimated, where the image's own is not known
-    intrinsics_cov: Array | None = None  # (q, q) of camera.estimate; focal as its logarithm
+    intrinsics_cov: Array | None = None  # (q, q) of steps of camera.estimate, see ESTIMABLE
     candidates: tuple[str, ...] = ()  # references that were tried, the most promising first
 
     @property
     def intrinsic_sigmas(self) -> dict[str, tuple[float, float]]:
-        """Value and 1-sigma of what was estimated of the camera; focal in pixels (fx)."""
+        """Value and 1-sigma of what was estimated of the camera; focal (fx), cx, cy in pixels."""
         if self.camera is None or self.intrinsics_cov is None:
             return {}
         sigmas = np.sqrt(np.diag(self.intrinsics_cov))
         values = [self.camera.value(name) for name in self.camera.estimate]
-        units = [self.camera.fx if name == "focal" else 1.0 for name in self.camera.estimate]
+        units = [self.camera.unit(name) for name in self.camera.estimate]
         names = self.camera.estimate
         return {n: (v, float(s * u)) for n, v, s, u in zip(names, values, sigmas, units, strict=True)}
 

@@ -237,8 +237,8 @@ CASES: dict[str, tuple[Callable, str, list[str], int | None]] = {
     ),
     "an unknown that cannot be estimated": (
         read_cameras,
-        CAMERA_HEADER.strip() + ",estimate\ncam,3000,2000,2800,2800,1500,1000,focal cx\n",
-        ["Column 'estimate' has 'focal cx'", '"focal k1"', "leave it empty"],
+        CAMERA_HEADER.strip() + ",estimate\ncam,3000,2000,2800,2800,1500,1000,focal k3\n",
+        ["Column 'estimate' has 'focal k3'", '"focal k1"', "leave it empty"],
         2,
     ),
     "no focal length, and not declared unknown": (

@@ -10,6 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from georef.geometry.camera import (
+    ESTIMABLE,
     Camera,
     CameraModel,
     ideal_from_observed,
@@ -92,7 +93,7 @@ def test_derivatives_of_rays_are_those_of_differences(lens: Camera) -> None:
 
 @_CAMERAS
 def test_derivatives_by_intrinsics_are_those_of_a_changed_camera(lens: Camera) -> None:
-    names = ("focal",) if lens.model == "pinhole" else ("focal", "k1", "k2")
+    names = tuple(n for n in ESTIMABLE if lens.model != "pinhole" or n[0] != "k")
     points = 3.0 * rays_from_pixels(lens, grid(lens))
     ours = intrinsic_derivatives(lens, points, names)
     assert ours.shape == (len(points), 2, len(names))
@@ -154,7 +155,7 @@ def test_the_model_follows_from_the_distortion_or_is_named() -> None:
     assert camera((0.1, 0.0, 0.0, 0.0)).model == "brown"
     assert camera((), "fisheye").model == "fisheye"
     assert replace(camera(), estimate=("focal", "k1")).model == "brown"
-    for bad in ({"distortion": (0.0,) * 6}, {"distortion": (0.0,) * 5, "model": "fisheye"}, {"estimate": ("cx",)}):
+    for bad in ({"distortion": (0.0,) * 6}, {"distortion": (0.0,) * 5, "model": "fisheye"}, {"estimate": ("skew",)}):
         with pytest.raises(ValueError, match="camera 'c'"):
             replace(camera(), **bad)
 
@@ -165,6 +166,9 @@ def test_a_changed_camera_has_its_focal_length_scaled_and_its_coefficients_shift
     assert changed.distortion == pytest.approx((-0.05, 0.02, 1e-3, 0.0))
     assert changed.value("focal") == changed.fx
     assert changed.value("k1") == changed.distortion[0]
+    moved = camera().changed(("cx", "cy", "aspect"), [0.01, -0.01, np.log(1.02)])
+    assert (moved.cx, moved.cy, moved.fx, moved.fy) == pytest.approx((3045.0, 1960.0, 3500.0, 3559.8))
+    assert moved.unit("cx") == moved.value("focal")
 
 
 def test_the_optical_axis_hits_the_principal_point_and_x_is_right() -> None:

@@ -95,7 +95,7 @@ def test_a_camera_that_the_table_lacks_is_named_with_its_row(two_cameras: Path) 
 
 def test_a_reference_camera_cannot_be_unknown(tiny_tables: Path) -> None:
     (tiny_tables / "camera.csv").write_text("camera,width,height,estimate\ncam,640,480,focal\n", encoding="utf-8")
-    with pytest.raises(InputError, match=r"(?s)'cam' is to be estimated \(focal\), and reference.*camera\.csv"):
+    with pytest.raises(InputError, match=r"(?s)'cam' is to be estimated \(focal, cx, cy, aspect\), and reference.*camera\.csv"):
         survey(tiny_tables)
 
 
@@ -199,7 +199,7 @@ def test_an_unknown_camera_starts_from_exif_or_from_the_usual_view(tiny_tables: 
     photograph(tiny_tables / EPOCH / "n0.jpg", (640, 480), {0xA405: 26})
     photograph(tiny_tables / EPOCH / "n1.jpg", (600, 800), {})
     known, plain, broken = (image.camera for image in survey(tiny_tables).epoch.images)  # n2.jpg is an empty file
-    assert known.estimate == plain.estimate == broken.estimate == ("focal", "k1")
+    assert known.estimate == plain.estimate == broken.estimate == ("focal", "k1", "cx", "cy")
     assert known.fx == known.fy == pytest.approx(26.0 / np.hypot(36.0, 24.0) * 800.0)
     assert (plain.fx, plain.cx, plain.cy, plain.width) == (pytest.approx(960.0), 300.0, 400.0, 600)
     assert broken.width == broken.height
@@ -342,7 +342,7 @@ def test_init_finds_several_references_and_their_cameras(tiny_tables: Path, tmp_
     made = open_project(tmp_path / "made", data=tiny_tables)
     assert list(made.file.reference_epochs) == ["new", "old"]
     assert made.file.reference_epochs["old"].cameras == "cameras_old.csv"
-    assert made.file.epochs[EPOCH].unknown == ("focal", "k1")
+    assert made.file.epochs[EPOCH].unknown == ("focal", "k1", "cx", "cy")
     assert "reference old: 8 images, omega-phi-kappa in deg" in written.said
     assert f"epoch {EPOCH}: no table of cameras, focal length and k1 are to be estimated" in written.said
     assert len(load_survey(made, EPOCH).reference.images) == 16

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from georef.errors import InputError
 from georef.geometry.angles import (
     omega_phi_kappa_from_rotation,
     rotation_from_omega_phi_kappa,
@@ -143,7 +144,7 @@ def test_named_camera_models(tmp_path: Path) -> None:
 def test_cameras_that_are_not_known(tmp_path: Path) -> None:
     rows = "a,80,60,,,,,focal\nb,80,60,90,91,41,31,focal+k1\nc,80,60,70,71,41,31,\n"
     cameras = read_cameras(written(tmp_path, "camera,width,height,fx,fy,cx,cy,estimate\n" + rows))
-    assert cameras["a"] == Camera("a", 80, 60, 96.0, 96.0, 40.0, 30.0, estimate=("focal",))
+    assert cameras["a"] == Camera("a", 80, 60, 96.0, 96.0, 40.0, 30.0, estimate=("focal", "cx", "cy", "aspect"))
     assert cameras["b"] == Camera("b", 80, 60, 90.0, 91.0, 41.0, 31.0, (0.0,) * 4, "brown", ("focal", "k1"))
     assert cameras["c"].estimate == ()
     only = read_cameras(written(tmp_path, "camera,width,height,estimate\na,60,80,focal\n"))
@@ -225,5 +226,5 @@ def test_gnss_without_any_sigma_has_none(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("header", ["image,x,y,z,sigma_x", "image,x,y,z,Sigma_East"])
 def test_some_sigmas_alone_are_refused(tmp_path: Path, header: str) -> None:
-    with pytest.raises(InputError, match="has no column 'sigma_[xy]'"):
+    with pytest.raises(InputError, match=r"has no column 'sigma_[xy]'"):
         read_gnss(written(tmp_path, f"{header}\na,1,2,3,0.1\n"), crs_kind="local")

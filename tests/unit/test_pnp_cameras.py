@@ -122,6 +122,8 @@ def wrong(camera: Camera, *names: str) -> Camera:
     distortion = () if "k1" in names and camera.model != "fisheye" else camera.distortion
     if "k2" not in names and "k1" in names:
         distortion = (0.0, *camera.distortion[1:])
+    if "cx" in names:
+        camera = replace(camera, cx=camera.cx + 14.0, cy=camera.cy - 17.0)
     return replace(camera, fx=focal, fy=focal * camera.fy / camera.fx, distortion=distortion, estimate=names)
 
 
@@ -129,7 +131,9 @@ def intrinsic_errors(estimate: EstimatedPose, camera: Camera) -> Array:
     names = estimate.camera.estimate
     return np.array(
         [
-            np.log(estimate.camera.fx / camera.fx) if n == "focal" else estimate.camera.value(n) - camera.value(n)
+            np.log(estimate.camera.fx / camera.fx)
+            if n == "focal"
+            else (estimate.camera.value(n) - camera.value(n)) / estimate.camera.unit(n)
             for n in names
         ]
     )
@@ -139,6 +143,7 @@ _UNKNOWN: dict[str, tuple[Callable[..., World], Camera, tuple[str, ...], tuple[f
     "focal": (court, LONG, ("focal",), (1e-4, 5e-3)),
     "focal, k1": (court, BENT, ("focal", "k1"), (1e-4, 5e-3)),
     "focal, k1, k2": (court, BENT, ("focal", "k1", "k2"), (1e-4, 5e-3)),
+    "focal, principal point": (court, LONG, ("focal", "cx", "cy"), (1e-4, 5e-3)),
     "k1 alone": (court, BENT, ("k1",), (1e-5, 1e-2)),
     "focal of a fisheye": (hall, FISHEYE_190, ("focal",), (1e-5, 2e-3)),
 }

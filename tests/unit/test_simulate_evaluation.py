@@ -75,7 +75,7 @@ def test_every_epoch_is_an_ordinary_one(project: Project, world: EvaluationWorld
         "vehicle": {("brown", ())},
         "vehicle_undistorted": {("pinhole", ())},
         "fisheye": {("fisheye", ())},
-        "phone": {("brown", ("focal", "k1"))},
+        "phone": {("brown", ("focal", "k1", "cx", "cy"))},
         "phone_rolled": {("brown", ())},
         "panorama": {("pinhole", ())},
     }
