@@ -95,14 +95,14 @@ def _uses_map(config: Config) -> bool:
 
 STAGES: tuple[Stage, ...] = (
     Stage("features", 1, ("features",), _all_images, (), features.run),
-    Stage("network", 2, _NETWORK_KEYS, _reference_with_images, (), network.run, of_reference=True),
+    Stage("network", 3, _NETWORK_KEYS, _reference_with_images, (), network.run, of_reference=True),
     Stage("index", 1, ("retrieval",), _reference_with_images, (), index.run, _uses_index, of_reference=True),
     Stage(
         "global-map", 1, _MAP_KEYS, _reference_with_images, ("network",), global_map.run, _uses_map, of_reference=True
     ),
-    Stage("localize", 3, _LOCALIZE_KEYS, _epoch_files, ("features", "network", "index", "global-map"), localize.run),
-    Stage("adjust", 3, ("adjust", "localize", "matching"), _control, ("features", "network", "localize"), adjust.run),
-    Stage("report", 1, ("report",), _check, ("features", "network", "localize", "adjust"), report.run),
+    Stage("localize", 4, _LOCALIZE_KEYS, _epoch_files, ("features", "network", "index", "global-map"), localize.run),
+    Stage("adjust", 4, ("adjust", "localize", "matching"), _control, ("features", "network", "localize"), adjust.run),
+    Stage("report", 2, ("report",), _check, ("features", "network", "localize", "adjust"), report.run),
 )
 
 
