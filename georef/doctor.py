@@ -159,13 +159,15 @@ def check_space(folder: Path) -> Finding:
 
 
 def _components(project: Project) -> Iterator[Finding]:
-    from georef.features.registry import EXTRACTORS, MATCHERS, load_component
+    from georef.features.registry import EXTRACTORS, GLOBAL_DESCRIPTORS, MATCHERS, load_component
 
     config = project.config
     try:
         extractor = load_component(EXTRACTORS, config.features.extractor)
         matcher = load_component(MATCHERS, config.matching.matcher, **config.matching.options)
+        descriptor = load_component(GLOBAL_DESCRIPTORS, config.retrieval.descriptor, **config.retrieval.options)
         yield Finding("ok", f"features {extractor.version()}; matches {matcher.version()}")
+        yield Finding("ok", f"global descriptor {descriptor.version()}")
     except GeorefError as error:
         yield _failed(error)
 

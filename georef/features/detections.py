@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,5 +34,5 @@ class Detections:
             np.concatenate([part.keypoints_px for part in parts]),
             np.concatenate([part.scores for part in parts]),
             np.concatenate([part.scales_px for part in parts]),
-            np.concatenate([part.descriptors for part in parts]),
+            cast(Descriptors, np.concatenate([part.descriptors for part in parts])),
         )

@@ -89,7 +89,7 @@ GLOBAL_DESCRIPTORS = ComponentTable(
 )
 
 
-def load_component(table: ComponentTable, name: str, *, device: str | None = None, **options: Any) -> Any:
+def load_component(table: ComponentTable, name: str, *, device: Any = None, **options: Any) -> Any:
     """Make the component of that name: `load_component(EXTRACTORS, "sift")`; options go to its constructor.
 
     device: "cpu", "cuda" or "auto", for components that have a choice; the others do without.

@@ -56,6 +56,7 @@ def test_the_same_pixel_as_colmap(camera: Camera) -> None:
     pose = pycolmap.Rigid3d(pycolmap.Rotation3d(cam_from_world.rotation), cam_from_world.translation)
     in_cam = np.array([pose * point for point in points_in_world()])
     pixels = colmap_camera(camera).img_from_cam(in_cam)
+    assert pixels is not None
     np.testing.assert_allclose(project(camera, cam_from_world.apply(points_in_world())), pixels, atol=1e-9)
     rays = rays_from_pixels(camera, pixels)
     slopes = rays[:, :2] / rays[:, 2:]

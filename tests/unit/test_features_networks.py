@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import cv2
 import numpy as np
 import pytest
@@ -18,7 +20,7 @@ from georef.features.xfeat_network import XFeatNetwork, sample_cells
 CPU = torch.device("cpu")
 
 
-def _weights(name: str) -> dict[str, torch.Tensor]:
+def _weights(name: str) -> dict[str, Any]:
     try:
         return load_state_dict(name)
     except WeightsError as error:

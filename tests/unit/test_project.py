@@ -54,7 +54,7 @@ def test_settings_reach_the_project_and_the_configuration(tiny_tables: Path) -> 
         tiny_tables, settings=("crs.height=EPSG:7837", "adjust.gnss=false", "reference.sigma=estimate")
     )
     assert project.file.crs.height == "EPSG:7837"
-    assert project.file.reference.sigma == "estimate"
+    assert project.file.reference_epochs["reference"].sigma == "estimate"
     assert not project.config.adjust.gnss
 
 
