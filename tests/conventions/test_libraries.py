@@ -62,6 +62,7 @@ def test_the_same_pixel_as_colmap(camera: Camera) -> None:
     slopes = rays[:, :2] / rays[:, 2:]
     np.testing.assert_allclose(slopes, in_cam[:, :2] / in_cam[:, 2:], atol=1e-12)
     theirs = colmap_camera(camera).cam_from_img(pixels)
+    assert theirs is not None
     np.testing.assert_allclose(slopes, theirs, atol=4e-10)  # COLMAP stops at 1e-10 of a slope
 
 

@@ -95,9 +95,8 @@ def test_a_camera_that_the_table_lacks_is_named_with_its_row(two_cameras: Path) 
 
 def test_a_reference_camera_cannot_be_unknown(tiny_tables: Path) -> None:
     (tiny_tables / "camera.csv").write_text("camera,width,height,estimate\ncam,640,480,focal\n", encoding="utf-8")
-    with pytest.raises(
-        InputError, match=r"(?s)'cam' is to be estimated \(focal, cx, cy, aspect\), and reference.*camera\.csv"
-    ):
+    expected = r"(?s)'cam' is to be estimated \(focal, cx, cy, aspect\), and reference.*camera\.csv"
+    with pytest.raises(InputError, match=expected):
         survey(tiny_tables)
 
 
