@@ -38,6 +38,7 @@ VERBS = [
     "benchmark",
     "benchmark vectors",
     "benchmark features",
+    "benchmark extraction",
 ]
 GEOREF = [sys.executable, "-c", "from georef.cli import main; main()"]
 POSES = "# CRS: EPSG:25832, height: ellipsoidal, metres.\nimage,easting,northing,height,omega,phi,kappa\n"
