@@ -248,11 +248,13 @@ def test_the_default_tables_fit_the_configuration(finished: Bench) -> None:
     for variant in (v for table in listed for v in table.variants):
         source.open(variant)
     boxes = [source.open(v)[0].config.candidates for v in listed[3].variants]
-    assert [(c.box, c.half_side_m, c.heading_window_deg) for c in boxes] == [
+    five = [
         ("none", 100.0, 180.0),
         *(("fixed", 100.0, angle) for angle in (180.0, 90.0)),
         *(("fixed", 15.0, angle) for angle in (180.0, 90.0)),
     ]
+    assert [(c.box, c.half_side_m, c.heading_window_deg) for c in boxes] == 2 * five  # of two global descriptors
+    assert {c.ranking for c in boxes} == {"global"}
 
 
 @pytest.mark.parametrize(

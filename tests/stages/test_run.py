@@ -138,10 +138,10 @@ def test_the_command_says_a_line_a_stage_and_where_results_are(
     bench = copied()
     assert exit_code(app, ["run", str(bench.data), "-o", str(bench.output)]) == 0
     lines = capsys.readouterr().out.splitlines()
-    assert [line.split()[0] for line in lines[:5]] == STAGES
-    assert all(line.endswith("[kept]") for line in lines[:5])
-    assert [line.split()[0] for line in lines[5:]] == ["poses.csv", "localization.csv", "report.html", "report.json"]
-    assert all(Path(line.split()[-1]).is_file() for line in lines[5:])
+    assert [line.split()[0] for line in lines[: len(STAGES)]] == STAGES
+    assert all(line.endswith("[kept]") for line in lines[: len(STAGES)])
+    assert [line.split()[0] for line in lines[len(STAGES) :]] == ["poses.csv", "localization.csv", "report.html", "report.json"]
+    assert all(Path(line.split()[-1]).is_file() for line in lines[len(STAGES) :])
 
 
 def test_the_report_is_rendered_again_from_its_data(
