@@ -138,10 +138,11 @@ def test_the_command_says_a_line_a_stage_and_where_results_are(
     bench = copied()
     assert exit_code(app, ["run", str(bench.data), "-o", str(bench.output)]) == 0
     lines = capsys.readouterr().out.splitlines()
-    assert [line.split()[0] for line in lines[: len(STAGES)]] == STAGES
-    assert all(line.endswith("[kept]") for line in lines[: len(STAGES)])
-    assert [line.split()[0] for line in lines[len(STAGES) :]] == ["poses.csv", "localization.csv", "report.html", "report.json"]
-    assert all(Path(line.split()[-1]).is_file() for line in lines[len(STAGES) :])
+    of_stages, of_files = lines[: len(STAGES)], lines[len(STAGES) :]
+    assert [line.split()[0] for line in of_stages] == STAGES
+    assert all(line.endswith("[kept]") for line in of_stages)
+    assert [line.split()[0] for line in of_files] == ["poses.csv", "localization.csv", "report.html", "report.json"]
+    assert all(Path(line.split()[-1]).is_file() for line in of_files)
 
 
 def test_the_report_is_rendered_again_from_its_data(
