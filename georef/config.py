@@ -60,6 +60,7 @@ class CandidatesConfig(Section):
     half_side_m: float = Field(default=100.0, gt=0)
     unstated_half_side_m: float = Field(default=500.0, gt=0)
     heading_window_deg: float = Field(default=90.0, gt=0, le=180)
+    fallback: bool = True
     epochs: list[str] = []
     ranking: Literal["global-votes", "global", "votes"] = "global-votes"
     shortlist: int = Field(default=50, ge=2)

@@ -19,7 +19,7 @@ from georef.executor import Executor
 from georef.io.files import write_text_atomically
 from georef.project import Project
 from georef.stages import adjust, features, global_map, index, localize, network, report
-from georef.stages.base import Meter, Run, StageContext, StageSummary
+from georef.stages.base import Meter, Run, StageContext, StageSummary, feature_id
 from georef.stages.survey import Survey, load_survey
 from georef.types.campaign import Campaign
 
@@ -81,7 +81,7 @@ _NETWORK_KEYS = (
     "adjust.max_iterations",
 )
 
-_MAP_KEYS = ("matching", "global_map")
+_MAP_KEYS = ("matching", "global_map", "candidates.epochs")
 _LOCALIZE_KEYS = ("matching", "candidates", "localize")
 
 
@@ -94,7 +94,7 @@ def _uses_map(config: Config) -> bool:
 
 
 STAGES: tuple[Stage, ...] = (
-    Stage("features", 1, ("features",), _all_images, (), features.run),
+    Stage("features", 2, ("features",), _all_images, (), features.run),
     Stage("network", 3, _NETWORK_KEYS, _reference_with_images, (), network.run, of_reference=True),
     Stage("index", 1, ("retrieval",), _reference_with_images, (), index.run, _uses_index, of_reference=True),
     Stage(
@@ -207,8 +207,14 @@ def _run_stage(stage: Stage, context: StageContext, parts: dict[str, Any]) -> St
 
 def _results_exist(context: StageContext, stage: str) -> bool:
     """Whether what a finished stage left is still there: files may have been deleted since."""
+    left = {
+        "network": context.folder / network.RESULT,
+        "index": context.folder / index.VECTORS,
+        "global-map": context.folder / global_map.STRUCTURE,
+        "adjust": context.folder / adjust.RESULT,
+    }
     checks = {"localize": localize.outcomes_exist, "report": report.outputs_exist}
-    return stage not in checks or checks[stage](context)
+    return checks[stage](context) if stage in checks else stage not in left or left[stage].exists()
 
 
 def _state_of(project: Project, epoch: str, stage: Stage, folder: Path, parts: dict[str, Any]) -> StageState:
@@ -254,7 +260,20 @@ def _plain(value: Any) -> Any:
 
 
 def _states_of(survey: Survey, *campaigns: Campaign) -> str:
-    return _hash([_state(survey.source_of(image)) for campaign in campaigns for image in campaign.images])
+    """A hash of what decides the features of images: their files, how they are cut, their keys and sizes."""
+    return _hash(
+        [
+            [
+                feature_id(image),
+                image.path.name,
+                image.camera.width,
+                image.camera.height,
+                _state(survey.source_of(image)),
+            ]
+            for campaign in campaigns
+            for image in campaign.images
+        ]
+    )
 
 
 def _state(path: Path) -> list[Any]:

@@ -245,6 +245,7 @@ def open_project(
     project_layer, config_layer = _split_overrides(parse_overrides(settings))
     file = validated(ProjectFile, merge(read_toml(path), project_layer), str(path))
     config = load_config(preset or file.preset, (file.config, config_layer))
+    _check_epochs(config, list(file.reference_epochs))
     folder = path.parent.resolve()
     return Project(
         file=file,
@@ -253,6 +254,15 @@ def open_project(
         data_root=_data_root(file, folder, data),
         output=(output or folder).resolve(),
     )
+
+
+def _check_epochs(config: Config, known: list[str]) -> None:
+    for name in config.candidates.epochs:
+        if name not in known:
+            raise ConfigError(
+                f"The key 'candidates.epochs' names '{name}', which is no reference epoch of the project.",
+                f"Expected some of: {', '.join(known)}.",
+            )
 
 
 def _split_overrides(overrides: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:

@@ -120,7 +120,7 @@ def variants_of(table: TableSection, source: Source) -> list[Variant]:
     names = sorted({image.epoch for image in load_survey(project, epoch).reference.images})
     if len(names) < 2:
         return [base.model_copy(update={"name": _joined(names[0], base)}) for base in table.variants]
-    rows: Sequence[tuple[str, list[str]]] = [*((name, [name]) for name in names), ("all", names)]
+    rows: Sequence[tuple[str, list[str]]] = [*((name, [name]) for name in names), ("all", [])]
     return [
         base.model_copy(update={"name": _joined(row, base), "set": _with_epochs(base.set, chosen)})
         for base in table.variants

@@ -17,38 +17,49 @@ from georef.types.features import Features
 
 _VOTE_RATIO = 0.95
 _MAX_VIEWING_ANGLE_DEG = 60.0
+_ANY_HEADING_DEG = 180.0
 
 
 @dataclass(frozen=True, eq=False)
 class Box:
-    """The references inside the search box, nearest first; without a box all of them, in their own order."""
+    """The references that may take part: those inside the search box and the heading window, nearest first."""
 
     indices: NDArray[np.int64]
-    whole_reference: bool
+    whole_reference: bool  # nothing was left out
     note: str = ""
     centre: Array | None = None  # (3,) m
     half_side_m: float | None = None
+    heading_rad: float | None = None  # middle of the heading window; None: any heading
 
 
-def search_box(
-    positions: Array, prior: PositionPrior | None, config: CandidatesConfig, near: Array | None = None
-) -> Box:
-    """References (of positions (N, 3)) inside a square box about a position prior; widened until there are enough.
+@dataclass(frozen=True, eq=False)
+class Whereabouts:
+    """What is known of where a query was taken: a prior, or at least a place to search about; a heading."""
 
-    near: (3,) the position to search about where there is no prior, one whose sigma nobody states.
+    prior: PositionPrior | None = None
+    near: Array | None = None  # (3,) m, a position whose sigma nobody states
+    heading_rad: float | None = None
 
-    Half the side is the stated uncertainty ("published"), max(min_half_side, 3 sigma + viewing reach) ("reach"), or
-    half_side_m ("fixed"); "none" takes the whole reference, as an image without a prior does. References whose
-    position is NaN do not take part.
+    @property
+    def centre(self) -> Array | None:
+        return self.near if self.prior is None else self.prior.position_in_world
+
+
+def search_box(positions: Array, headings_rad: Array, where: Whereabouts, config: CandidatesConfig) -> Box:
+    """References (positions (N, 3), headings (N,)) about a position and within a heading window.
+
+    Half the side of the square is the stated uncertainty ("published"), max(min_half_side, 3 sigma + viewing reach)
+    ("reach"), or half_side_m ("fixed"); it is widened until enough references that look the right way are inside.
+    "none" has no box, and neither has an image of unknown position.
     """
-    everything = np.flatnonzero(np.isfinite(positions[:, :2]).all(axis=1))
-    if config.box == "none":
-        return Box(everything, True)
-    centre = near if prior is None else prior.position_in_world
-    if centre is None:
-        return Box(everything, True, "no position prior: searched the whole reference")
-    offset = np.abs(positions[:, :2] - centre[:2]).max(axis=1)
-    asked = _half_side(prior, config)
+    heading = where.heading_rad if config.heading_window_deg < _ANY_HEADING_DEG else None
+    looking = np.flatnonzero(in_heading_window(headings_rad, heading, config.heading_window_deg))
+    centre = where.centre
+    if centre is None or config.box == "none":
+        note = "no position prior: searched the whole reference" if centre is None and config.box != "none" else ""
+        return _without_box(positions, looking, centre, heading, note)
+    offset = np.abs(positions[looking, :2] - centre[:2]).max(axis=1)
+    asked = _half_side(where.prior, config)
     half_side, needed = asked, min(config.count, int(np.isfinite(offset).sum()))
     while np.count_nonzero(offset <= half_side) < needed:
         half_side *= 2.0
@@ -57,8 +68,22 @@ def search_box(
     if half_side > asked:
         found = np.count_nonzero(offset <= asked)
         note = f"search box widened from {asked:.1f} to {half_side:.1f} m half side: {found} of {needed} references"
-    order = np.argsort(offset[inside], kind="stable")
-    return Box(inside[order], len(inside) == len(everything), note, centre, half_side)
+    indices = looking[inside[np.argsort(offset[inside], kind="stable")]]
+    return Box(indices, len(indices) == len(positions), note, centre, half_side, heading)
+
+
+def everywhere(positions: Array, where: Whereabouts) -> Box:
+    """The whole reference (positions (N, 3)), the nearest first as far as anything is known of the place."""
+    return _without_box(positions, np.arange(len(positions)), where.centre, None, "")
+
+
+def _without_box(
+    positions: Array, indices: NDArray[np.int64], centre: Array | None, heading_rad: float | None, note: str
+) -> Box:
+    if centre is not None:
+        offset = np.abs(positions[indices, :2] - centre[:2]).max(axis=1)
+        indices = indices[np.argsort(offset, kind="stable")]
+    return Box(indices, len(indices) == len(positions), note, heading_rad=heading_rad)
 
 
 def _half_side(prior: PositionPrior | None, config: CandidatesConfig) -> float:
@@ -73,11 +98,14 @@ def _half_side(prior: PositionPrior | None, config: CandidatesConfig) -> float:
 
 
 def in_heading_window(headings_rad: Array, heading_rad: float | None, window_deg: float) -> NDArray[np.bool_]:
-    """References whose viewing direction is within a window of a known heading; all where none is known."""
+    """References whose viewing direction is within a window of a known heading; all where none is known.
+
+    A reference that looks up or down has no heading (NaN), and passes.
+    """
     if heading_rad is None:
         return np.ones(len(headings_rad), bool)
     difference = np.angle(np.exp(1j * (headings_rad - heading_rad)))
-    return np.abs(difference) <= np.radians(window_deg)
+    return np.isnan(difference) | (np.abs(difference) <= np.radians(window_deg))
 
 
 def vote(query: Features, references: Sequence[Features]) -> NDArray[np.int64]:

@@ -8,7 +8,7 @@ from dataclasses import replace
 from numpy.typing import NDArray
 
 from georef.config import CandidatesConfig, LocalizeConfig
-from georef.estimation.candidates import Box, search_box
+from georef.estimation.candidates import Box, Whereabouts
 from georef.estimation.pose_from_map import from_global_model, from_local_model
 from georef.estimation.prior_check import against_prior
 from georef.estimation.query import Query
@@ -44,15 +44,16 @@ def localize_image(
     """
     if len(features) < config.min_inliers:
         return Rejected(image.image_id, RejectReason.FEW_FEATURES, f"{len(features)} keypoints")
-    search = Search(reference, features, image.heading_rad, candidates, find_similar)
+    where = Whereabouts(image.gnss, image.near, image.heading_rad)
+    search = Search(reference, features, where, candidates, find_similar)
     query = Query(image, features, reference, matcher, config, match_keypoints, search)
-    box = search_box(search.positions, image.gnss, candidates, image.near)
+    box = search.box()
     outcome = _localize_in(query, box)
-    if isinstance(outcome, Rejected) and not box.whole_reference:
+    if isinstance(outcome, Rejected) and candidates.fallback and not box.whole_reference:
         query.notes.append(
             f"inside the search box: {outcome.reason.value} ({outcome.detail}); tried the whole reference"
         )
-        outcome = _localize_in(query, search_box(search.positions, None, candidates))
+        outcome = _localize_in(query, search.everywhere())
     judged = against_prior(outcome, image, config)
     return replace(judged, notes=tuple(query.notes), cpu_s=dict(query.cpu_s), candidates=query.tried)
 

@@ -60,10 +60,9 @@ def _pair_verifier(query: Query, chosen: list[int], references: list[PosedFeatur
     def verify(a: int, b: int) -> pycolmap.TwoViewGeometry:
         if b == len(chosen):
             return verify_pair(references[a], query.posed, query.matcher, query.match_keypoints)
-        key = chosen[a], chosen[b]
-        if key not in query.reference.pairs:
-            geometry = verify_pair(references[a], references[b], query.matcher, query.match_keypoints)
-            query.reference.pairs[key] = geometry
-        return query.reference.pairs[key]
+        return query.reference.pair(
+            (chosen[a], chosen[b]),
+            lambda: verify_pair(references[a], references[b], query.matcher, query.match_keypoints),
+        )
 
     return verify

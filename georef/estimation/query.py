@@ -69,7 +69,7 @@ def consensus(query: Query, model: LocalModel) -> FirstPose | Rejected:
     query.use(query.image.camera)
     found = ransac_pose(query.observed, model, query.config.ransac_gate_px, query.config.seed)
     inliers = 0 if found is None else int(found.inliers.sum())
-    if found is None or not _enough(inliers, len(model), query.config):
+    if found is None or not _enough(inliers, model, query.config):
         detail = f"{inliers} of {len(model)} points agree with one pose"
         return Rejected(query.image.image_id, RejectReason.FEW_INLIERS, detail)
     query.use(found.camera)
@@ -81,7 +81,7 @@ def outcome_of(query: Query, estimate: EstimatedPose | None, model: LocalModel, 
     if estimate is None:
         return Rejected(image_id, RejectReason.DEGENERATE, f"{len(model)} points do not fix the pose")
     inliers = int(estimate.inliers.sum())
-    if not _enough(inliers, len(model), query.config):
+    if not _enough(inliers, model, query.config):
         return Rejected(image_id, RejectReason.FEW_INLIERS, f"{inliers} of {len(model)} points agree with one pose")
     sigma = float(np.sqrt(np.linalg.eigvalsh(estimate.cov[3:, 3:])[-1]))
     if sigma > query.config.max_position_sigma_m:
@@ -106,8 +106,9 @@ def outcome_of(query: Query, estimate: EstimatedPose | None, model: LocalModel, 
     )
 
 
-def _enough(inliers: int, points: int, config: LocalizeConfig) -> bool:
-    return inliers >= config.min_inliers and inliers >= config.min_inlier_ratio * points
+def _enough(inliers: int, model: LocalModel, config: LocalizeConfig) -> bool:
+    """Whether enough points agree; of several points of one keypoint, one at most can."""
+    return inliers >= config.min_inliers and inliers >= config.min_inlier_ratio * len(np.unique(model.keypoint))
 
 
 def _thinned(

@@ -8,7 +8,6 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from georef.estimation.guided import PosedFeatures
 from georef.geometry.projection import Views
@@ -25,6 +24,7 @@ StructureReader = Callable[[int], ImageStructure]
 """What the precomputed map holds of a reference image, by its place among all of them."""
 
 _KEPT_IMAGES = 64
+_KEPT_PAIRS = 2000  # a few hundred matches each
 
 
 class ReferenceMap:
@@ -43,8 +43,7 @@ class ReferenceMap:
         self.positions: Array = np.array([pose.translation for pose in self.poses]).reshape(-1, 3)
         forward = np.array([pose.rotation[:, 2] for pose in self.poses]).reshape(-1, 3)
         self.headings_rad: Array = np.arctan2(forward[:, 0], forward[:, 1])
-        self.epochs: NDArray[np.str_] = np.array([image.epoch for image in self.images], dtype=str)
-        self.pairs: dict[tuple[int, int], Any] = {}  # verified pairs of references, filled by the published way
+        self._pairs: OrderedDict[tuple[int, int], Any] = OrderedDict()
         self._read, self._read_structure = read_features, read_structure
         self._heads: OrderedDict[tuple[int, int], Features] = OrderedDict()
         self._posed: OrderedDict[int, PosedFeatures] = OrderedDict()
@@ -73,6 +72,10 @@ class ReferenceMap:
             raise ValueError("this reference has no precomputed map")
         read = self._read_structure
         return _remember(self._structures, index, _KEPT_IMAGES, lambda: read(index))
+
+    def pair(self, indices: tuple[int, int], verify: Callable[[], Any]) -> Any:
+        """What is known of a pair of references, found once as long as it is among those used last."""
+        return _remember(self._pairs, indices, _KEPT_PAIRS, verify)
 
     def views(self, indices: Sequence[int]) -> Views:
         return Views.of([self.poses[i] for i in indices], [self.images[i].camera for i in indices])

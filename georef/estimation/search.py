@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from georef.config import CandidatesConfig
-from georef.estimation.candidates import Box, in_heading_window, vote
+from georef.estimation.candidates import Box, Whereabouts, everywhere, search_box, vote
 from georef.estimation.reference_map import ReferenceMap
 from georef.geometry.rigid import Array
 from georef.types.features import Features
@@ -20,8 +20,8 @@ _NEIGHBOURS_OF_A_POSE = 200
 class FindSimilar(Protocol):
     """The vector database, asked for one query: whose global descriptors are nearest to the query's."""
 
-    def __call__(self, count: int, box: Box, heading_rad: float | None, config: CandidatesConfig) -> NDArray[np.int64]:
-        """At most `count` indices into the reference map, inside box, heading window and epochs, most similar first."""
+    def __call__(self, count: int, box: Box, config: CandidatesConfig) -> NDArray[np.int64]:
+        """At most `count` indices into the reference map, inside box and heading window, most similar first."""
         ...
 
 
@@ -31,42 +31,37 @@ class Search:
 
     reference: ReferenceMap
     features: Features
-    heading_rad: float | None
+    where: Whereabouts
     config: CandidatesConfig
     find_similar: FindSimilar | None = None
+
+    def box(self) -> Box:
+        """Where the query is looked for first."""
+        return search_box(self.reference.positions, self.reference.headings_rad, self.where, self.config)
+
+    def everywhere(self) -> Box:
+        """Where it is looked for then."""
+        return everywhere(self.reference.positions, self.where)
 
     def ranked(self, box: Box) -> tuple[NDArray[np.int64], str]:
         """References that may show what the query shows, the most promising first, and a note where some were left."""
         config = self.config
         if config.ranking == "votes":
-            inside = self._inside(box)
-            left = len(inside) - config.max_searched
-            note = f"searched the nearest {config.max_searched} of {len(inside)} references" if left > 0 else ""
-            return self._by_votes(inside[: config.max_searched]), note
+            left = len(box.indices) - config.max_searched
+            which = "first" if self.where.centre is None else "nearest"
+            note = f"searched the {which} {config.max_searched} of {len(box.indices)} references" if left > 0 else ""
+            return self._by_votes(box.indices[: config.max_searched]), note
         if self.find_similar is None:
             raise ValueError(f"the ranking {config.ranking!r} needs a vector database")
         count = config.count if config.ranking == "global" else config.shortlist
-        similar = self.find_similar(count, box, self.heading_rad, config)
+        similar = self.find_similar(count, box, config)
         return similar if config.ranking == "global" else self._by_votes(similar), ""
-
-    @property
-    def positions(self) -> Array:
-        """Positions (N, 3) of the references; NaN for those of epochs that do not take part."""
-        if not self.config.epochs:
-            return self.reference.positions
-        return np.where(np.isin(self.reference.epochs, self.config.epochs)[:, None], self.reference.positions, np.nan)
 
     def with_neighbours(self, ranked: NDArray[np.int64], position: Array) -> NDArray[np.int64]:
         """The ranked references, then those nearest to a position (3,), which similarity may have missed."""
-        distance = np.linalg.norm(self.positions - position, axis=1)
-        near = np.argsort(distance, kind="stable")[:_NEIGHBOURS_OF_A_POSE]  # NaN comes last
-        near = near[np.isfinite(distance[near])]
+        distance = np.linalg.norm(self.reference.positions - position, axis=1)
+        near = np.argsort(distance, kind="stable")[:_NEIGHBOURS_OF_A_POSE]
         return np.concatenate([ranked, near[~np.isin(near, ranked)]])
-
-    def _inside(self, box: Box) -> NDArray[np.int64]:
-        """References of the box that are in the heading window, in the order of the box."""
-        headings = self.reference.headings_rad[box.indices]
-        return box.indices[in_heading_window(headings, self.heading_rad, self.config.heading_window_deg)]
 
     def _by_votes(self, indices: NDArray[np.int64]) -> NDArray[np.int64]:
         count = self.config.vote_keypoints

@@ -5,7 +5,8 @@ from __future__ import annotations
 import logging
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import cached_property
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -13,12 +14,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from georef.config import CandidatesConfig, Config
+from georef.errors import StageError
 from georef.estimation.candidates import Box
 from georef.estimation.search import FindSimilar
 from georef.features.globals.base import GlobalDescriptor, Needs, Row
 from georef.features.globals.state import LearnedState
 from georef.features.images import UnreadableImage, read_image
 from georef.features.registry import GLOBAL_DESCRIPTORS, load_component
+from georef.geometry.angles import heading_of
 from georef.stages.base import StageContext, StageSummary, feature_id, open_features
 from georef.stages.features import failed_images
 from georef.store.vector_index import IndexRow, VectorIndex
@@ -27,6 +30,7 @@ from georef.types.features import Features
 
 STATE, VECTORS = "descriptor.safetensors", "vectors"
 _LEARNED_FROM = 2000  # images, evenly chosen: more teach little, and learning goes through them twice
+_COMMITTED_TOGETHER = 500  # images: what an interruption may lose
 logger = logging.getLogger(__name__)
 
 
@@ -39,7 +43,9 @@ def run(context: StageContext) -> StageSummary:
     vectors = open_vectors(context.folder, task.descriptor)
     there = vectors.keys()
     pending = [image for image in images if feature_id(image) not in there]
-    vectors.upsert(_rows(pending, context.executor.map_items(task, pending, "index")))
+    rows = _rows(pending, context.executor.map_items(task, pending, "index"))
+    while vectors.upsert(islice(rows, _COMMITTED_TOGETHER)):
+        pass
     vectors.optimize()
     name = task.config.retrieval.descriptor
     line = f"{len(vectors)} of {len(images)} reference images in the vector database, by {name}"
@@ -73,8 +79,9 @@ class DescribeTask:
         """Learns from reference images, unless that was done or there is nothing to learn."""
         made = _made(self.config)
         if _learns(made) and not self.state_path.is_file():
-            step = max(1, len(images) // _LEARNED_FROM)
-            made.learn(_Contents(made.needs, images[::step], self.store_folder)).save(self.state_path)
+            chosen = np.unique(np.linspace(0, len(images) - 1, _LEARNED_FROM).round().astype(int))
+            sample = [images[i] for i in chosen]
+            made.learn(_Contents(made.needs, sample, self.store_folder)).save(self.state_path)
 
     def __call__(self, image: Image) -> Row | None:
         for content in _Contents(self.descriptor.needs, [image], self.store_folder):
@@ -114,26 +121,37 @@ class SimilarImages:
     row_of: Mapping[str, int]  # index into the reference map, by key in the database
 
     def to_image(self, image: Image, features: Features) -> FindSimilar:
-        """The search for one image. Raises UnreadableImage."""
-        needs_pixels = self.task.descriptor.needs == "pixels"
-        return partial(self._nearest, self.task.describe(read_image(image.path) if needs_pixels else features))
+        """The search for one image, which is described when it is first searched for."""
+        return _Search(self, image, features)
 
-    def _nearest(
-        self, row: Row, count: int, box: Box, heading_rad: float | None, config: CandidatesConfig
-    ) -> NDArray[np.int64]:
+
+@dataclass(eq=False)
+class _Search:
+    """One image in the vector database."""
+
+    similar: SimilarImages
+    image: Image
+    features: Features
+
+    @cached_property
+    def row(self) -> Row:
+        task = self.similar.task
+        return task.describe(read_image(self.image.path) if task.descriptor.needs == "pixels" else self.features)
+
+    def __call__(self, count: int, box: Box, config: CandidatesConfig) -> NDArray[np.int64]:
         """Asks for more where what comes is not in the map: references that were set aside since."""
         asked = count
         while True:
-            found = self.vectors.nearest(
-                row,
+            found = self.similar.vectors.nearest(
+                self.row,
                 asked,
                 centre=box.centre,
                 half_side_m=box.half_side_m,
-                heading_rad=heading_rad,
-                heading_window_deg=None if heading_rad is None else config.heading_window_deg,
+                heading_rad=box.heading_rad,
+                heading_window_deg=None if box.heading_rad is None else config.heading_window_deg,
                 epochs=config.epochs or None,
             )
-            known = [self.row_of[key] for key in found.keys if key in self.row_of]
+            known = [self.similar.row_of[key] for key in found.keys if key in self.similar.row_of]
             if len(known) >= count or len(found.keys) < asked:
                 return np.array(known[:count], np.int64)
             asked *= 2
@@ -142,17 +160,23 @@ class SimilarImages:
 def open_index(folder: Path, store_folder: Path, config: Config, references: Iterable[Image]) -> SimilarImages:
     """The vector database of a finished stage, for the references of a map in their order."""
     task = DescribeTask(config, store_folder, folder / STATE)
-    rows = {feature_id(image): row for row, image in enumerate(references)}
-    return SimilarImages(task, open_vectors(folder, task.descriptor), rows)
+    vectors = open_vectors(folder, task.descriptor)
+    if len(vectors) == 0:
+        raise StageError(
+            "The vector database of the reference is empty.",
+            "Delete its folder and run again: it is made from the stored features.",
+            f"In {folder}",
+        )
+    return SimilarImages(task, vectors, {feature_id(image): row for row, image in enumerate(references)})
 
 
 def _rows(images: Sequence[Image], described: Iterable[Row | None]) -> Iterator[IndexRow]:
     for image, row in zip(images, described, strict=True):
         pose = image.world_from_cam
         if row is not None and pose is not None:
-            forward = pose.rotation[:, 2]
-            heading = float(np.arctan2(forward[0], forward[1]))
-            yield IndexRow(feature_id(image), pose.translation, heading, image.epoch, image.camera.camera_id, row)
+            heading = heading_of(pose.rotation)
+            known = None if np.isnan(heading) else heading
+            yield IndexRow(feature_id(image), pose.translation, known, image.epoch, image.camera.camera_id, row)
 
 
 def _made(config: Config) -> Any:

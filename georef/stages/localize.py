@@ -108,10 +108,16 @@ def run(context: StageContext) -> StageSummary:
 
 
 def make_task(context: StageContext) -> LocalizeTask:
+    """The reference as it takes part: of the chosen epochs, without suspects and what has no features."""
+    epochs = set(context.config.candidates.epochs or context.project.file.reference_epochs)
     noise, suspects = read_noise(context.before["network"])
     failed = failed_images(context.before["features"])
     reference = context.survey.reference
-    usable = tuple(i for i in reference.images if i.image_id not in suspects and feature_id(i) not in failed)
+    usable = tuple(
+        image
+        for image in reference.images
+        if image.epoch in epochs and image.image_id not in suspects and feature_id(image) not in failed
+    )
     if len(usable) < 2:
         raise StageError(f"Only {len(usable)} reference images can be used, at least two are needed.")
     campaign, folders = Campaign(reference.epoch, usable), context.before

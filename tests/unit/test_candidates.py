@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from georef.config import CandidatesConfig
-from georef.estimation.candidates import in_heading_window, overlap, search_box, vote
+from georef.estimation.candidates import Box, Whereabouts, everywhere, in_heading_window, overlap, vote
+from georef.estimation.candidates import search_box as box_about
 from georef.geometry.projection import Views
 from georef.geometry.rigid import Array, exp_so3
 from georef.types.campaign import PositionPrior
@@ -17,6 +18,13 @@ def prior(sigma_east: float, sigma_north: float | None = None) -> PositionPrior:
     return PositionPrior(
         np.array([100.0, 50.0, 3.0]), np.diag(np.square([sigma_east, sigma_north or sigma_east, 1000.0]))
     )
+
+
+def search_box(
+    positions: Array, given: PositionPrior | None, config: CandidatesConfig, near: Array | None = None
+) -> Box:
+    """About positions alone: every reference looks north, and the query too."""
+    return box_about(positions, np.zeros(len(positions)), Whereabouts(given, near, 0.0), config)
 
 
 def line_of_positions(spacing: float, count: int = 41) -> Array:
@@ -87,14 +95,25 @@ def test_no_box_on_request_even_with_a_prior() -> None:
     assert (len(box.indices), box.whole_reference, box.half_side_m) == (41, True, None)
 
 
-def test_references_that_do_not_take_part_are_not_counted() -> None:
+def test_references_that_look_elsewhere_are_not_counted() -> None:
     positions = line_of_positions(10.0)
-    positions[::2] = np.nan
-    box = search_box(positions, prior(1.0), CandidatesConfig(box="fixed", half_side_m=51.0, count=4))
+    headings = np.where(np.arange(len(positions)) % 2 == 0, np.pi, 0.0)
+    where = Whereabouts(prior(1.0), None, 0.1)
+    box = box_about(positions, headings, where, CandidatesConfig(box="fixed", half_side_m=51.0, count=4))
     assert set(box.indices) == {15, 17, 19, 21, 23, 25}
-    assert not box.whole_reference
-    box = search_box(positions, prior(1.0), CandidatesConfig(box="fixed", half_side_m=1000.0))
-    assert (len(box.indices), box.whole_reference) == (20, True)
+    box = box_about(positions, headings, where, CandidatesConfig(box="fixed", half_side_m=30.0, count=10))
+    assert (len(box.indices), box.half_side_m) == (12, 120.0)  # ten of those that look the same way
+    box = box_about(positions, headings, where, CandidatesConfig(box="fixed", half_side_m=1000.0))
+    assert (len(box.indices), box.whole_reference) == (20, False)
+    any_way = CandidatesConfig(box="fixed", half_side_m=1000.0, heading_window_deg=180.0)
+    box = box_about(positions, headings, where, any_way)
+    assert (len(box.indices), box.whole_reference, box.heading_rad) == (41, True, None)
+
+
+def test_everywhere_begins_with_the_nearest_and_asks_for_no_heading() -> None:
+    box = everywhere(line_of_positions(10.0), Whereabouts(prior(1.0), None, 0.1))
+    assert (list(box.indices[:3]), len(box.indices), box.heading_rad) == ([20, 19, 21], 41, None)
+    assert list(everywhere(line_of_positions(10.0), Whereabouts()).indices[:3]) == [0, 1, 2]
 
 
 def test_no_references_at_all() -> None:
@@ -113,6 +132,7 @@ def test_heading_window_across_the_half_turn() -> None:
     np.testing.assert_array_equal(in_heading_window(headings, np.radians(185.0), 25.0), inside)
     assert in_heading_window(headings, None, 1.0).all()
     assert in_heading_window(headings, 0.3, 180.0).all()
+    assert in_heading_window(np.array([np.nan]), 0.3, 10.0).all()  # it looks up: it may show the place
 
 
 def test_votes_rank_common_content() -> None:

@@ -184,15 +184,19 @@ def test_no_prior_searches_the_whole_reference() -> None:
     assert position_error(made, outcome) < 0.06
 
 
-def test_a_wrong_heading_finds_no_candidates_and_a_right_one_does() -> None:
+def test_a_wrong_heading_leaves_the_whole_reference_to_try() -> None:
     made = survey(court(8), 8)
     forward = made.truth.rotation[:, 2]
     heading = float(np.arctan2(forward[0], forward[1]))
     near = made.truth.translation + 1.0
     right = localize(made, new_image("q", near, heading_rad=heading + 0.3))
     assert position_error(made, localized(right)) < 0.06
-    wrong = rejected(localize(made, new_image("q", near, heading_rad=heading + np.pi)))
-    assert wrong.reason == RejectReason.NO_CANDIDATES
+    turned = new_image("q", near, heading_rad=heading + np.pi)
+    boxed = CandidatesConfig(ranking="votes", fallback=False)
+    assert rejected(localize(made, turned, candidates=boxed)).reason == RejectReason.NO_CANDIDATES
+    found = localized(localize(made, turned))
+    assert position_error(made, found) < 0.06
+    assert any("tried the whole reference" in note for note in found.notes)
 
 
 def on_one_plane(world: World, flat: Array) -> World:
