@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from georef.estimation.guided import PosedFeatures
+from georef.geometry.angles import heading_of
 from georef.geometry.projection import Views
 from georef.geometry.rigid import Array, Rigid3
 from georef.types.campaign import Campaign, Image
@@ -41,8 +42,7 @@ class ReferenceMap:
         self.poses: list[Rigid3] = [image.world_from_cam for image in self.images if image.world_from_cam is not None]
         self.noise = noise
         self.positions: Array = np.array([pose.translation for pose in self.poses]).reshape(-1, 3)
-        forward = np.array([pose.rotation[:, 2] for pose in self.poses]).reshape(-1, 3)
-        self.headings_rad: Array = np.arctan2(forward[:, 0], forward[:, 1])
+        self.headings_rad: Array = np.array([heading_of(pose.rotation) for pose in self.poses])  # NaN: up or down
         self.epochs: NDArray[np.str_] = np.array([image.epoch for image in self.images], dtype=str)
         self.pairs: dict[tuple[int, int], Any] = {}  # verified pairs of references, filled by the published way
         self._read, self._read_structure = read_features, read_structure
