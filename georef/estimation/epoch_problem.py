@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
@@ -28,7 +29,7 @@ from georef.executor import Progress
 from georef.features.base import Matcher
 from georef.geometry.projection import Views, linearize
 from georef.geometry.rigid import Array
-from georef.types.campaign import Image, PosePrior
+from georef.types.campaign import Image, PosePrior, PositionPrior
 from georef.types.constraints import ControlPoint
 from georef.types.results import Localized, ReferenceNoise
 from georef.types.scene import Observations
@@ -225,9 +226,11 @@ def _marked_in(control: tuple[ControlPoint, ...], image_ids: Sequence[str]) -> t
 
 
 def _position_priors(images: Sequence[Image], localized: Sequence[Localized]):
-    """GNSS of the images whose localization does not already contradict it."""
-    return {
-        i: image.gnss
-        for i, (image, result) in enumerate(zip(images, localized, strict=True))
-        if image.gnss is not None and not result.gnss_rejected
-    }
+    """GNSS of the images whose localization does not already contradict it; images of one station share one fix.
+
+    Each of n such images gets it with n times its covariance, so that together they know no more than was measured.
+    """
+    taking = [i for i, result in enumerate(localized) if images[i].gnss is not None and not result.gnss_rejected]
+    together = Counter(images[i].station for i in taking if images[i].station is not None)
+    priors = {i: (images[i].gnss, together.get(images[i].station, 1)) for i in taking}
+    return {i: PositionPrior(p.position_in_world, n * p.cov) for i, (p, n) in priors.items() if p is not None}

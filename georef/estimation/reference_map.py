@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from georef.estimation.guided import PosedFeatures
+from georef.geometry.angles import heading_of
 from georef.geometry.projection import Views
 from georef.geometry.rigid import Array, Rigid3
 from georef.types.campaign import Campaign, Image
@@ -41,8 +42,7 @@ class ReferenceMap:
         self.poses: list[Rigid3] = [image.world_from_cam for image in self.images if image.world_from_cam is not None]
         self.noise = noise
         self.positions: Array = np.array([pose.translation for pose in self.poses]).reshape(-1, 3)
-        forward = np.array([pose.rotation[:, 2] for pose in self.poses]).reshape(-1, 3)
-        self.headings_rad: Array = np.arctan2(forward[:, 0], forward[:, 1])
+        self.headings_rad: Array = np.array([heading_of(pose.rotation) for pose in self.poses])  # NaN: up or down
         self._pairs: OrderedDict[tuple[int, int], Any] = OrderedDict()
         self._read, self._read_structure = read_features, read_structure
         self._heads: OrderedDict[tuple[int, int], Features] = OrderedDict()

@@ -12,8 +12,9 @@ from georef.features.tiling import detect_in_tiles
 from georef.geometry.pixels import level_size, resize_keypoints
 from georef.types.features import Features, Matches
 
-__all__ = ["Descriptors", "Detections", "Extractor", "Image", "Matcher", "extract_features"]
+__all__ = ["EXTRACTION_VERSION", "Descriptors", "Detections", "Extractor", "Image", "Matcher", "extract_features"]
 
+EXTRACTION_VERSION = 1  # rises when the same detections of a level give other features: tiles, structure, resampling
 SMALLEST_SIDE_PX = 16  # below this a level holds nothing that a detector could localise
 STRUCTURE_RADIUS_PX = 4  # of the window in a level about a keypoint that must show something
 _BUDGETS = ((1024, 4096), (2048, 6144))  # keypoints of levels whose longest side is at most so many pixels

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from georef.errors import InputError
+from georef.pictures import LARGEST_PX, open_picture
 
 _JPEG_END = b"\xff\xd9"
 
@@ -24,20 +25,20 @@ def read_image(path: Path) -> NDArray[np.uint8]:
     and a picture that turns itself would swap them without a word. Grey images are repeated to three channels, 16-bit
     grey is brought down to its upper 8 bits, transparency is dropped.
 
-    Raises UnreadableImage for a missing file, something that is not an image, and a truncated file (OpenCV would fill
-    the missing part with grey and say nothing).
+    Raises UnreadableImage for a missing file, something that is not an image, a truncated file (OpenCV would fill the
+    missing part with grey and say nothing), and one of more than `LARGEST_PX` pixels.
     """
     try:
-        with Image.open(path) as image:
+        with open_picture(path) as image:
             image.load()  # Pillow raises for a truncated file as long as ImageFile.LOAD_TRUNCATED_IMAGES is False
             pixels = _rgb(image)
             is_jpeg = image.format in ("JPEG", "MPO")
     except FileNotFoundError as error:
         raise UnreadableImage("The image file does not exist.", path=path) from error
-    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
+    except OSError as error:
         raise UnreadableImage(
             f"The image cannot be read: {error}.",
-            expected="a complete JPEG, PNG or TIFF file",
+            expected=f"a complete JPEG, PNG or TIFF file of at most {LARGEST_PX * 1e-6:.0f} megapixels",
             remedy="Copy the file again from its source.",
             path=path,
         ) from error

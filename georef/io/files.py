@@ -5,10 +5,10 @@ from __future__ import annotations
 import codecs
 import difflib
 import logging
-import uuid
 from pathlib import Path
 
 from georef.errors import InputError
+from georef.replacing import replacing
 
 log = logging.getLogger(__name__)
 
@@ -57,14 +57,8 @@ def write_bytes_atomically(data: bytes, path: Path | str) -> None:
 
     Folders are created. An existing file stays as it is until the new one is complete. Raises OSError.
     """
-    path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{uuid.uuid4().hex}.tmp")  # short: names of items may be as long as a name can be
-    try:
+    with replacing(Path(path)) as temporary:
         temporary.write_bytes(data)
-        temporary.replace(path)
-    finally:
-        temporary.unlink(missing_ok=True)
 
 
 def _read_bytes(path: Path) -> bytes:

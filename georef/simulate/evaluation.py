@@ -13,6 +13,7 @@ from functools import cached_property
 
 import numpy as np
 
+from georef.geometry.angles import heading_of
 from georef.geometry.camera import Camera
 from georef.geometry.panorama import RIG_FROM_PANO, PanoramaHead
 from georef.geometry.rigid import Rigid3
@@ -192,9 +193,8 @@ class PositionSystem:
 def drawn_positions(
     world: StreetWorld, poses: Sequence[Rigid3], system: PositionSystem, purpose: str
 ) -> tuple[list[np.ndarray], list[float]]:
-    """Positions in world and headings in degrees, off by what the system states."""
+    """Positions in world and headings in degrees (NaN: it looks up or down), off by what the system states."""
     rng = world.rng("positions", purpose)
     positions = [pose.translation + np.array(system.sigmas_m) * rng.normal(size=3) for pose in poses]
-    forward = [pose.rotation[:, 2] for pose in poses]
-    exact = np.degrees([np.arctan2(f[0], f[1]) for f in forward])
+    exact = np.degrees([heading_of(pose.rotation) for pose in poses])
     return positions, list((exact + system.heading_deg * rng.normal(size=len(poses))) % 360.0)

@@ -6,7 +6,6 @@ error; that of the second is exact but for the noise of the ranges.
 
 from __future__ import annotations
 
-import secrets
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,6 +18,7 @@ from pyproj import CRS as PyprojCrs
 from georef.crs import WorldFrame
 from georef.geometry.angles import rotation_x, rotation_z
 from georef.geometry.rigid import Array
+from georef.replacing import replacing
 from georef.simulate.street import Epoch
 from georef.simulate.trajectory import Motion, rig_rotations
 from georef.simulate.world import CRS, REFERENCE, StreetWorld
@@ -107,16 +107,10 @@ def write_scan(world: StreetWorld, epoch: Epoch, folder: Path, scanner: Scanner 
     path = folder / scan_file(epoch)
     if path.is_file():
         return path
-    folder.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{secrets.token_hex(6)}{path.suffix}")
     header = _header(world.frame)
-    try:
-        with laspy.open(str(temporary), mode="w", header=header) as writer:
-            for chunk in scan(world, epoch, scanner):
-                writer.write_points(_record(chunk, header, world.frame))
-        temporary.replace(path)
-    finally:
-        temporary.unlink(missing_ok=True)
+    with replacing(path, path.suffix) as temporary, laspy.open(str(temporary), mode="w", header=header) as writer:
+        for chunk in scan(world, epoch, scanner):
+            writer.write_points(_record(chunk, header, world.frame))
     return path
 
 

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from georef.crs import WorldFrame
-from georef.geometry.angles import omega_phi_kappa_from_rotation
+from georef.geometry.angles import heading_of, omega_phi_kappa_from_rotation
 from georef.geometry.camera import Camera
 from georef.geometry.rigid import Array, Rigid3
 from georef.simulate.lenses import Lens
@@ -67,16 +67,20 @@ def coordinates(position: Array) -> list[str]:
     return [f"{value:.5f}" for value in position]
 
 
+def _heading(heading_deg: float) -> str:
+    """Empty for an image that looks up or down: it has no heading."""
+    return "" if np.isnan(heading_deg) else f"{heading_deg:.2f}"
+
+
 def gnss_table(images: Sequence[WorldImage], measured: Measured, frame: WorldFrame) -> str:
     """Measured positions of the projection centres, reduced by the lever arms, and headings of the optical axes."""
     poses = [measured.world_from_rigs[image.station] @ image.head.rig_from_cam for image in images]
     positions = frame.crs_from_world(np.array([pose.translation for pose in poses]))
     rows = []
     for image, pose, position in zip(images, poses, positions, strict=True):
-        forward = pose.rotation[:, 2]
-        heading = np.degrees(np.arctan2(forward[0], forward[1])) % 360.0
+        heading = np.degrees(heading_of(pose.rotation)) % 360.0
         sigmas = (f"{v:.3f}" for v in measured.sigma_m[image.station])
-        rows.append((image.image_id, *(f"{v:.3f}" for v in position), *sigmas, f"{heading:.2f}"))
+        rows.append((image.image_id, *(f"{v:.3f}" for v in position), *sigmas, _heading(heading)))
     header = "image,easting,northing,height,sigma_e,sigma_n,sigma_h,heading_deg"
     return table(_CRS_LINE + _SIGMAS + " Headings: degrees clockwise from true north.", header, rows)
 
@@ -93,7 +97,7 @@ def position_table(
     rows = []
     for name, position, heading in zip(positions_in_world, positions, headings_deg, strict=True):
         camera = [cameras[name]] if cameras else []
-        rows.append((name, *(f"{v:.3f}" for v in (*position, *sigmas_m)), f"{heading:.2f}", *camera))
+        rows.append((name, *(f"{v:.3f}" for v in (*position, *sigmas_m)), _heading(heading), *camera))
     header = "image,easting,northing,height,sigma_e,sigma_n,sigma_h,heading_deg" + (",camera" if cameras else "")
     return table(_CRS_LINE + _SIGMAS + " Headings: degrees clockwise from true north.", header, rows)
 

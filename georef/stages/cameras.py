@@ -97,7 +97,7 @@ def unknown_camera(path: Path, unknown: tuple[str, ...]) -> Camera:
     """
     try:
         size, focal = size_and_focal(path)
-    except (OSError, SyntaxError, ValueError):
+    except OSError:
         size, focal = _UNREADABLE, None
     start = DEFAULT_FOCAL * max(size) if focal is None else focal
     camera_id = f"unknown {size[0]}x{size[1]} {start:.0f} px"
@@ -116,7 +116,7 @@ def with_unknown(camera: Camera, unknown: tuple[str, ...], path: Path) -> Camera
     if "focal" in camera.estimate and camera.fx == camera.fy == DEFAULT_FOCAL * max(camera.width, camera.height):
         try:
             focal = size_and_focal(path)[1]
-        except (OSError, SyntaxError, ValueError):
+        except OSError:
             focal = None
         return started if focal is None else replace(started, fx=focal, fy=focal)
     return started
@@ -126,7 +126,7 @@ def pinhole_of_row(image_id: str, intrinsics: Sequence[float], path: Path) -> Ca
     """The camera whose fx, fy, cx, cy stand beside an image's orientation; of any size where the file is no image."""
     try:
         width, height = image_size(path)
-    except (OSError, SyntaxError, ValueError):  # it is rejected as unreadable before the size matters
+    except OSError:  # it is rejected as unreadable before the size matters
         width, height = _UNREADABLE
     fx, fy, cx, cy = (float(v) for v in intrinsics)
     return Camera(image_id, width, height, fx, fy, cx, cy)

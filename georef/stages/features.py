@@ -8,10 +8,11 @@ from functools import cached_property
 from pathlib import Path
 
 from georef.config import FeaturesConfig
-from georef.features.base import Extractor, extract_features
+from georef.features.base import EXTRACTION_VERSION, Extractor, extract_features
 from georef.features.images import UnreadableImage, read_image
 from georef.features.registry import EXTRACTORS, load_component
 from georef.stages.base import StageContext, StageSummary, feature_id
+from georef.stages.failures import internal_failure
 from georef.stages.panoramas import cut_missing
 from georef.store.feature_store import FeatureStore
 from georef.types.campaign import Image
@@ -31,16 +32,22 @@ class ExtractTask:
         return _load_extractor(self.config)
 
     def __call__(self, image: Image) -> tuple[str, str] | None:
+        extractor = self.extractor  # what keeps it from being loaded is no fault of the image
         try:
-            pixels = read_image(image.path)
+            return self._extract(extractor, image)
         except UnreadableImage as error:
             return RejectReason.UNREADABLE.value, error.problem
+        except Exception as error:
+            return internal_failure(error, f"extraction of {feature_id(image)}")
+
+    def _extract(self, extractor: Extractor, image: Image) -> tuple[str, str] | None:
+        pixels = read_image(image.path)
         camera, size = image.camera, (pixels.shape[1], pixels.shape[0])
         if size != (camera.width, camera.height):
             problem = f"the image has {size[0]} x {size[1]} px, its camera {camera.width} x {camera.height}"
             return RejectReason.WRONG_SIZE.value, problem
         level, budget = self.config.longest_side_px or None, self.config.max_keypoints or None
-        features = extract_features(self.extractor, pixels, level, budget)
+        features = extract_features(extractor, pixels, level, budget)
         _store(self.folder, self.version, self.config).write(feature_id(image), features, image.path)
         return None
 
@@ -70,11 +77,12 @@ def _store(folder: Path, version: str, config: FeaturesConfig) -> FeatureStore:
 
 
 def extractor_version(config: FeaturesConfig) -> str:
-    """What decides the features beside the image: the component, its weights and settings, level and budget."""
+    """What decides the features beside the image: the component, its weights and settings, what is
+    done alike for all components, level and budget."""
     level = f"longest side {config.longest_side_px or 'full'}"
     budget = f"at most {config.max_keypoints or 'the budget of the level'}"
     stored = "quantized" if config.quantize else "exact"
-    return f"{_load_extractor(config).version()}; {level}; {budget}; {stored}"
+    return f"{_load_extractor(config).version()}; extraction {EXTRACTION_VERSION}; {level}; {budget}; {stored}"
 
 
 def _load_extractor(config: FeaturesConfig) -> Extractor:

@@ -1,11 +1,13 @@
 """Stage `global-map`: all references matched and triangulated once; for `localize.method = "global-model"` alone.
 
 Matches are stored a reference image at a time, structure a block of images at a time: an interrupted run goes on, and
-no more than a block with its neighbours is in memory.
+no more than a block with its neighbours is in memory. A reference that cannot be read or computed has no matches and
+no points, which is logged and told in the summary; the others go on.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -14,13 +16,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from georef.estimation.global_model import Pair, block_structure, blocks_of, choose_pairs, match_pair
+from georef.estimation.guided import PosedFeatures
 from georef.geometry.frusta import Frusta
 from georef.io.items import item_ids, item_path, read_item, write_item
 from georef.io.structures import read_structure, write_structure
 from georef.stages.base import StageContext, StageSummary
+from georef.stages.failures import internal_failure
 from georef.stages.localize import STRUCTURE, LocalizeTask, make_task
+from georef.types.features import Matches
+from georef.types.scene import ImageStructure
 
 MATCHES = "matches"
+_NAMED = 5  # references without points that the summary names
 
 
 @dataclass
@@ -44,6 +51,16 @@ class MapTask:
     def path(self, kind: str, index: int) -> Path:
         return item_path(self.folder / kind, self.ids[index])
 
+    def posed(self, indices: Iterable[int]) -> dict[int, PosedFeatures]:
+        """References with their features, by their place; one whose features cannot be used is logged and left out."""
+        out: dict[int, PosedFeatures] = {}
+        for index in indices:
+            try:
+                out[index] = self.localize.map.posed(index)
+            except Exception as error:
+                internal_failure(error, f"reading of reference {self.ids[index]}")
+        return out
+
 
 @dataclass
 class MatchTask(MapTask):
@@ -52,14 +69,19 @@ class MatchTask(MapTask):
     def __call__(self, index: int) -> int:
         config = self.localize.config
         others = [b for a, b in self.partners[index] if a == index]
-        reference, matcher = self.localize.map, self.localize.matcher
-        count, gate = config.matching.max_keypoints, config.global_map.gate
-        own = reference.posed(index)
-        found = [match_pair(own, reference.posed(other), matcher, count, gate) for other in others]
-        header = {"partners": [self.ids[other] for other in others]}
-        arrays = {f"matches_{k}": matches.indices for k, matches in enumerate(found)}
+        matcher, count, gate = self.localize.matcher, config.matching.max_keypoints, config.global_map.gate
+        found: dict[int, Matches] = {}
+        posed = self.posed([index, *others])
+        for other in others:
+            if index in posed and other in posed:
+                try:
+                    found[other] = match_pair(posed[index], posed[other], matcher, count, gate)
+                except Exception as error:
+                    internal_failure(error, f"matching of references {self.ids[index]} and {self.ids[other]}")
+        header = {"partners": [self.ids[other] for other in found]}
+        arrays = {f"matches_{k}": matches.indices for k, matches in enumerate(found.values())}
         write_item(self.path(MATCHES, index), header, arrays)
-        return sum(map(len, found))
+        return sum(map(len, found.values()))
 
 
 @dataclass
@@ -67,15 +89,27 @@ class TriangulateTask(MapTask):
     """Triangulates a block of reference images; returns how many keypoints have a point."""
 
     def __call__(self, block: NDArray[np.int64]) -> int:
-        reference = self.localize.map
         members = sorted({int(i) for i in block} | {i for k in block for pair in self.partners[int(k)] for i in pair})
-        inside = set(members)
-        matches = {pair: m for i in members for pair, m in self._matches(i).items() if inside.issuperset(pair)}
-        posed = {index: reference.posed(index) for index in members}
-        found = block_structure([int(i) for i in block], posed, matches, self.localize.noise)
-        for index, structure in found.items():
-            write_structure(self.path(STRUCTURE, index), structure, self.ids)
+        posed = self.posed(members)
+        found = self._triangulated([int(i) for i in block if int(i) in posed], posed)
+        for index in (int(i) for i in block):
+            write_structure(self.path(STRUCTURE, index), found.get(index, ImageStructure.empty()), self.ids)
         return sum(map(len, found.values()))
+
+    def _triangulated(self, block: list[int], posed: Mapping[int, PosedFeatures]) -> dict[int, ImageStructure]:
+        """Where a block fails, it is halved with its partners, until only what is beside the cause has no points."""
+        if not block:
+            return {}
+        members = {*block, *(i for k in block for pair in self.partners[k] for i in pair)} & posed.keys()
+        matches = {pair: m for i in sorted(members) for pair, m in self._matches(i).items() if members.issuperset(pair)}
+        try:
+            return block_structure(block, {i: posed[i] for i in members}, matches, self.localize.noise)
+        except Exception as error:
+            internal_failure(error, f"triangulation of {len(block)} references from {self.ids[block[0]]} on")
+        if len(block) == 1:
+            return {}
+        half = len(block) // 2
+        return self._triangulated(block[:half], posed) | self._triangulated(block[half:], posed)
 
     def _matches(self, index: int) -> dict[Pair, NDArray[np.int32]]:
         header, arrays = read_item(self.path(MATCHES, index))
@@ -109,10 +143,14 @@ def run(context: StageContext) -> StageSummary:
 def _summary(task: MapTask, pairs: int, computed: int) -> StageSummary:
     places = {name: k for k, name in enumerate(task.ids)}
     points = observations = 0
+    without = []
     for index in range(len(task.ids)):
         structure = read_structure(task.path(STRUCTURE, index), places)
         points += int(np.count_nonzero(structure.identity[:, 0] == index))
         observations += len(structure)
+        without += [] if len(structure) else [task.ids[index]]
     line = f"{points} points from {pairs} pairs of {len(task.ids)} reference images"
-    data = {"points": points, "pairs": pairs, "keypoints_with_point": observations}
+    if without:
+        line += f"; {len(without)} without any: {', '.join(without[:_NAMED])}{', ...' if len(without) > _NAMED else ''}"
+    data = {"points": points, "pairs": pairs, "keypoints_with_point": observations, "without_points": without}
     return StageSummary(line, data, computed, len(task.ids))

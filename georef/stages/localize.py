@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from collections import Counter
 from dataclasses import dataclass
 from functools import cached_property
@@ -20,6 +19,7 @@ from georef.features.registry import MATCHERS, load_component
 from georef.io.items import item_ids, item_path, read_outcome, write_outcome
 from georef.io.structures import read_structure
 from georef.stages.base import StageContext, StageSummary, feature_id, open_features
+from georef.stages.failures import internal_failure
 from georef.stages.features import failed_images
 from georef.stages.index import SimilarImages, open_index
 from georef.stages.network import read_noise
@@ -29,7 +29,6 @@ from georef.types.results import Localized, Outcome, ReferenceNoise, Rejected, R
 from georef.types.scene import ImageStructure
 
 ITEMS, STRUCTURE = "items", "structure"
-logger = logging.getLogger(__name__)
 
 
 @dataclass
@@ -74,14 +73,15 @@ class LocalizeTask:
         failure = self.failed.get(feature_id(image))
         if failure is not None:
             return Rejected(image.image_id, RejectReason(failure[0]), failure[1])
+        index, reference, matcher = self.similar, self.map, self.matcher  # what keeps them from loading ends the run
         try:
             features = open_features(self.store_folder).read(feature_id(image))
-            similar = None if self.similar is None else self.similar.to_image(image, features)
+            similar = None if index is None else index.to_image(image, features)
             return localize_image(
                 image,
                 features,
-                self.map,
-                self.matcher,
+                reference,
+                matcher,
                 self.config.candidates,
                 self.config.localize,
                 self.config.matching.max_keypoints,
@@ -89,9 +89,9 @@ class LocalizeTask:
             )
         except UnreadableImage as error:
             return Rejected(image.image_id, RejectReason.UNREADABLE, error.problem)
-        except (ArithmeticError, ValueError, IndexError, np.linalg.LinAlgError) as error:
-            logger.exception("localization of %s failed", image.image_id)
-            return Rejected(image.image_id, RejectReason.INTERNAL, f"{type(error).__name__}: {error}")
+        except Exception as error:
+            reason, detail = internal_failure(error, f"localization of {image.image_id}")
+            return Rejected(image.image_id, RejectReason(reason), detail)
 
 
 def run(context: StageContext) -> StageSummary:

@@ -18,12 +18,14 @@ from urllib.parse import quote
 
 import numpy as np
 
+from georef.geometry.angles import heading_of, rotation_from_yaw_pitch_roll
 from georef.geometry.camera import Camera
 from georef.geometry.panorama import PanoramaHead, Projection, expected_size, standard_heads
 from georef.io.exif import image_size
 from georef.io.files import write_bytes_atomically
 from georef.io.head_table import read_heads
 from georef.project import PanoramaSection, Project
+from georef.stages.failures import internal_failure
 from georef.types.campaign import Campaign, Image, PositionPrior
 from georef.types.results import RejectReason
 
@@ -66,7 +68,7 @@ class Panoramas:
     def _heads_of(self, path: Path) -> tuple[PanoramaHead, ...]:
         try:
             size = image_size(path)
-        except (OSError, SyntaxError, ValueError):  # it is rejected where it is read; its heads are listed all the same
+        except OSError:  # it is rejected where it is read; its heads are listed all the same
             size = _UNKNOWN_SIZE
         return self.heads or standard_heads(self.section.projection, size)
 
@@ -78,6 +80,7 @@ class Panoramas:
         image = replace(
             panorama,
             image_id=image_id,
+            station=panorama.image_id,
             path=path,
             camera=head.camera,
             world_from_cam=pose,
@@ -106,10 +109,11 @@ def placeholder(image_id: str, path: Path, epoch: str) -> Image:
 
 def _head_heading(heading_rad: float | None, head: PanoramaHead) -> float | None:
     """The heading of a head on a level panorama; None where it looks up or down."""
-    forward = head.pano_from_head.rotation[:, 2]
-    if heading_rad is None or np.hypot(forward[0], forward[2]) < 0.1:
+    if heading_rad is None:
         return None
-    return float((heading_rad + np.arctan2(forward[0], forward[2])) % (2.0 * np.pi))
+    level_from_pano = rotation_from_yaw_pitch_roll((heading_rad, 0.0, 0.0))
+    heading = heading_of(level_from_pano @ head.pano_from_head.rotation)
+    return None if np.isnan(heading) else heading % (2.0 * np.pi)
 
 
 def _head_prior(panorama: Image, head: PanoramaHead) -> PositionPrior | None:
@@ -144,7 +148,7 @@ def is_panorama(path: Path, projection: Projection) -> bool:
     """Whether an image has the shape of its projection; a file that cannot be read is not judged."""
     try:
         return not expected_size(projection, image_size(path))
-    except (OSError, SyntaxError, ValueError):
+    except OSError:
         return True
 
 
@@ -165,15 +169,23 @@ def cut_missing(cutouts: Iterable[CutOut], executor: Executor) -> dict[Path, tup
 
 def cut(group: list[CutOut]) -> tuple[str, str] | None:
     """Cuts heads of one panorama; why it could not, or None."""
-    import cv2
-
-    from georef.features.images import UnreadableImage, read_image
-    from georef.features.panorama import cut_heads
+    from georef.features.images import UnreadableImage
 
     try:
-        panorama = read_image(group[0].source)
+        return _cut(group)
     except UnreadableImage as error:
         return RejectReason.UNREADABLE.value, f"panorama {group[0].source.name}: {error.problem}"
+    except Exception as error:
+        return internal_failure(error, f"cutting of panorama {group[0].source.name}")
+
+
+def _cut(group: list[CutOut]) -> tuple[str, str] | None:
+    import cv2
+
+    from georef.features.images import read_image
+    from georef.features.panorama import cut_heads
+
+    panorama = read_image(group[0].source)
     size, projection = (panorama.shape[1], panorama.shape[0]), group[0].projection
     if wanted := expected_size(projection, size):
         return RejectReason.WRONG_SIZE.value, f"{size[0]} x {size[1]} px; an image of {projection} is {wanted}"

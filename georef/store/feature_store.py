@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import secrets
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import partial
@@ -15,6 +14,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save_file
 
 from georef.errors import StageError
+from georef.replacing import replacing
 from georef.store.feature_encoding import EXACT, QUANTIZED, decode, encode
 from georef.types.features import Features
 
@@ -49,14 +49,9 @@ class FeatureStore:
         OSError where the disk refuses.
         """
         path = self._path(image_id)
-        self._folder.mkdir(parents=True, exist_ok=True)
         arrays, header = encode(features, self._quantize)
-        temporary = path.with_name(f"{secrets.token_hex(8)}.tmp")
-        try:
+        with replacing(path) as temporary:
             save_file(arrays, temporary, metadata=self._metadata(image_id, features, source) | header)
-            temporary.replace(path)
-        finally:
-            temporary.unlink(missing_ok=True)
 
     def has(self, image_id: str, source: Path | None = None) -> bool:
         """Whether usable features of this image are stored.

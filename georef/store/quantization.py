@@ -45,11 +45,6 @@ def unpack_rows(
     return rows
 
 
-def packed_width(size: int) -> int:
-    """Bytes of a packed row of `size` values."""
-    return BITS * _groups(size)
-
-
 def _groups(size: int) -> int:
     return -(-size // 8)
 

@@ -54,6 +54,7 @@ class Image:
     near: Array | None = (
         None  # (3,) m, a position that nobody states a sigma for: a place to search about, no observation
     )
+    station: str | None = None  # of images that were taken as one, the heads of a panorama: they share a position fix
     heading_rad: float | None = None  # of the optical axis, clockwise from the world's north
     given_sigma: PoseSigma | None = None  # of world_from_cam, where the project declares it
 

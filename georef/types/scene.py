@@ -54,5 +54,12 @@ class ImageStructure:
     cov: Array  # (P, 3, 3) of the image noise
     observations: Observations  # view is the place of an image among all references
 
+    @staticmethod
+    def empty() -> ImageStructure:
+        """Of a reference image that has no points."""
+        none = np.zeros(0, np.int64)
+        observations = Observations(none, none, np.zeros((0, 2)), np.zeros(0), none)
+        return ImageStructure(none, np.zeros((0, 2), np.int64), np.zeros((0, 3)), np.zeros((0, 3, 3)), observations)
+
     def __len__(self) -> int:
         return len(self.keypoint)

@@ -15,6 +15,7 @@ from georef.errors import InputError
 from georef.features.images import read_image
 from georef.geometry.camera import Camera, project
 from georef.geometry.rigid import Array
+from georef.pictures import open_picture
 
 _JPEG_QUALITY = 80
 logger = logging.getLogger(__name__)
@@ -56,7 +57,7 @@ def picture_jpeg(path: Path, camera: Camera, small: SmallPinhole) -> bytes | Non
 def _read_small(path: Path, small: SmallPinhole) -> NDArray[np.uint8]:
     """The image (H, W, 3) at its small size, in the sensor's own rows and columns."""
     size = (small.width, small.height)
-    with PillowImage.open(path) as image:
+    with open_picture(path) as image:
         if image.format == "JPEG":
             image.draft("RGB", size)  # lets the decoder leave out what would be averaged away
             return np.asarray(image.convert("RGB").resize(size, PillowImage.Resampling.BICUBIC, reducing_gap=3.0))

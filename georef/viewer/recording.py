@@ -6,13 +6,13 @@ is sent anywhere and no viewer is started; the file is put in place when it is c
 
 from __future__ import annotations
 
-import uuid
 from pathlib import Path
 
 import numpy as np
 import rerun as rr
 
 from georef.config import ReportConfig
+from georef.replacing import replacing
 from georef.viewer.blueprint import default_blueprint
 from georef.viewer.cameras import log_cameras
 from georef.viewer.scene import Scene
@@ -23,21 +23,21 @@ from georef.viewer.writer import Writer
 
 def write_recording(scene: Scene, config: ReportConfig, path: Path) -> None:
     """Writes the recording with its default blueprint; an existing one stays until the new one is complete."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.stem}.{uuid.uuid4().hex}.rrd")
+    with replacing(path, ".rrd") as temporary:
+        _write_stream(scene, config, temporary)
+
+
+def _write_stream(scene: Scene, config: ReportConfig, path: Path) -> None:
     stream = rr.RecordingStream("georef", recording_id=scene.run)
     try:
-        stream.save(temporary)
+        stream.save(path)
         writer = Writer(scene, stream, config.recording_image_side_px)
         _write_entities(writer, config.recording_max_points)
         middle, extent = scene.focus
         stream.send_blueprint(default_blueprint(writer.image_paths, writer.into_images, writer.hidden, middle, extent))
         stream.send_recording_name(scene.title)
-        stream.disconnect()  # writes what is left and closes the file
-        temporary.replace(path)
     finally:
-        stream.disconnect()
-        temporary.unlink(missing_ok=True)
+        stream.disconnect()  # writes what is left and closes the file
 
 
 def _write_entities(writer: Writer, most_points: int) -> None:

@@ -93,7 +93,7 @@ def normalized(pixels: torch.Tensor, statistics: tuple[Sequence[float], Sequence
     return (pixels - mean) / deviation
 
 
-def unit_rows(rows: NDArray[np.floating] | NDArray[np.uint8]) -> NDArray[np.float32]:
+def unit_or_even_rows(rows: NDArray[np.floating] | NDArray[np.uint8]) -> NDArray[np.float32]:
     """Rows (N, D) scaled to unit length; a row of zeros becomes one of equal components, so that all have it."""
     rows = np.asarray(rows, np.float32)
     lengths = np.linalg.norm(rows, axis=1, keepdims=True)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from georef.features.device import choose_device
-from georef.features.globals.base import Image, Needs, Row, unit_rows
+from georef.features.globals.base import Image, Needs, Row, unit_or_even_rows
 from georef.features.weights import version_tag
 from georef.types.features import Features
 
@@ -69,4 +69,4 @@ class PixelDescriptor:
     def _rows(self, inputs: Sequence[Tensor]) -> NDArray[np.float32]:
         with torch.inference_mode():
             rows = self._network(torch.stack(list(inputs)).to(self._device))
-        return unit_rows(rows.float().cpu().numpy())
+        return unit_or_even_rows(rows.float().cpu().numpy())

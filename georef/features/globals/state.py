@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import secrets
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -15,6 +14,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save_file
 
 from georef.errors import StageError
+from georef.replacing import replacing
 
 _FORMAT = "georef.global-descriptor.1"
 
@@ -38,14 +38,9 @@ class LearnedState:
 
     def save(self, path: Path) -> None:
         """Write the file whole, or not at all."""
-        path.parent.mkdir(parents=True, exist_ok=True)
-        temporary = path.with_name(f"{path.name}.{secrets.token_hex(8)}.tmp")
         metadata = {"format": _FORMAT, "learned_by": self.learned_by, "sha256": self.sha256}
-        try:
+        with replacing(path) as temporary:
             save_file({k: np.ascontiguousarray(v) for k, v in self.arrays.items()}, temporary, metadata=metadata)
-            temporary.replace(path)
-        finally:
-            temporary.unlink(missing_ok=True)
 
     @staticmethod
     def load(path: Path) -> LearnedState:

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from georef.errors import StageError
-from georef.features.globals.base import Image, Needs, Row, check_features, check_repeatable, unit_rows
+from georef.features.globals.base import Image, Needs, Row, check_features, check_repeatable, unit_or_even_rows
 from georef.features.globals.kmeans import assign, kmeans
 from georef.features.globals.sampling import Reservoir
 from georef.features.globals.state import LearnedState
@@ -108,7 +108,7 @@ class Vlad:
         return f"{self.name}-1 {settings} power={self._power} seed={self._seed}"
 
     def _descriptors(self, features: Features) -> NDArray[np.float32]:
-        return unit_rows(features.descriptors[: self._max_keypoints])
+        return unit_or_even_rows(features.descriptors[: self._max_keypoints])
 
     def _vlad(self, features: Features, centres: NDArray[np.float32]) -> NDArray[np.float32]:
         """The row (K x D,) of unit length, zero for an image without features."""

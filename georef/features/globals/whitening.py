@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import eigh
 
-from georef.features.globals.base import unit_rows
+from georef.features.globals.base import unit_or_even_rows
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,7 +23,7 @@ class Whitening:
         """Rows (N, D) as unit rows (N, size)."""
         out = np.zeros((len(rows), self.size), np.float32)
         out[:, : len(self.axes)] = (np.asarray(rows, np.float32) - self.mean) @ self.axes.T
-        return unit_rows(out)
+        return unit_or_even_rows(out)
 
 
 def learn_whitening(rows: NDArray[np.float32], size: int) -> Whitening:
