@@ -135,7 +135,7 @@ def epoch_problem(
         observations=observations.take(in_new),
         gcps=_automatic_gcps(observations.take(~in_new), len(points), len(new), used, reference),
         pose_priors=_pose_priors(localized, known, of_all=config.constraints == "pose-priors"),
-        position_priors=_position_priors(images, localized) if config.gnss else {},
+        position_priors=position_priors(images, localized) if config.gnss else {},
         control=_marked_in(control, [i.image_id for i, k in zip(images, known, strict=True) if k])
         if config.surveyed_control
         else (),
@@ -225,7 +225,7 @@ def _marked_in(control: tuple[ControlPoint, ...], image_ids: Sequence[str]) -> t
     return tuple(replace(p, marks=tuple(m for m in p.marks if m.image_id in image_ids)) for p in control)
 
 
-def _position_priors(images: Sequence[Image], localized: Sequence[Localized]):
+def position_priors(images: Sequence[Image], localized: Sequence[Localized]):
     """GNSS of the images whose localization does not already contradict it; images of one station share one fix.
 
     Each of n such images gets it with n times its covariance, so that together they know no more than was measured.

@@ -1,16 +1,19 @@
-"""Tie points of the new images: the pairs that are matched, wrong matches, and how many rays a point needs."""
+"""Tie points of the new images (the pairs that are matched, wrong matches, how many rays), and shared position fixes."""
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import numpy as np
 
 from georef.config import AdjustConfig
-from georef.estimation.epoch_problem import match_new_images, tie_pairs
+from georef.estimation.epoch_problem import match_new_images, position_priors, tie_pairs
 from georef.executor import Silent
 from georef.features.nearest import MutualNearest
+from georef.types.campaign import PositionPrior
 from georef.types.results import Localized
 from tests.worlds.blocks import block
-from tests.worlds.points import Seen, court, loose_cov, photograph
+from tests.worlds.points import Seen, court, loose_cov, new_image, photograph
 
 
 def photographs(seed: int, **options: float) -> tuple[list[Seen], list[Localized]]:
@@ -58,3 +61,19 @@ def test_a_tie_point_has_as_many_rays_as_asked_for() -> None:
         tie[problem.gcps.point] = False
         assert tie.sum() > 3
         assert (count[tie] >= rays).all()
+
+
+def test_images_of_one_station_share_its_position_fix() -> None:
+    """Together they know what was measured, and no more."""
+    seen, results = photographs(4)
+    fix = np.diag([0.04, 0.09, 0.25])
+    stations = ["pano", None, "pano", None]
+    images = [
+        replace(new_image(f"q{i}", s.truth.translation), gnss=PositionPrior(s.truth.translation, fix), station=station)
+        for i, (s, station) in enumerate(zip(seen[:4], stations, strict=True))
+    ]
+    priors = position_priors(images, [results[0], replace(results[1], gnss_rejected=True), results[2], results[3]])
+    assert sorted(priors) == [0, 2, 3]
+    together = sum(np.linalg.inv(priors[i].cov) for i in (0, 2))
+    np.testing.assert_allclose(np.linalg.inv(together), fix)
+    np.testing.assert_allclose(priors[3].cov, fix)
