@@ -1,4 +1,4 @@
-"""Tie points of the new images (the pairs that are matched, wrong matches, how many rays), and shared position fixes."""
+"""Tie points of the new images (pairs that are matched, wrong matches, how many rays), and shared position fixes."""
 
 from __future__ import annotations
 
