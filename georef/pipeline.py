@@ -173,13 +173,11 @@ def _scope(stage: Stage, epoch: str) -> str:
 
 def _components(stage: Stage, config: Config) -> str:
     """What else than configuration and inputs decides the result: versions of the components that a stage uses."""
-    versions = {
-        "features": lambda: features.extractor_version(config.features),
-        "index": lambda: index.descriptor_version(config),
-        "global-map": lambda: localize.matcher_version(config),
-        "localize": lambda: localize.matcher_version(config),
-    }
-    return versions[stage.name]() if stage.name in versions else ""
+    if stage.name == "features":
+        return features.extractor_version(config.features)
+    if stage.name == "index":
+        return index.descriptor_version(config)
+    return localize.matcher_version(config) if stage.name in ("localize", "global-map") else ""
 
 
 def _run_stage(stage: Stage, context: StageContext, parts: dict[str, Any]) -> StageResult:
