@@ -10,6 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from georef.geometry.angles import (
+    heading_of,
     omega_phi_kappa_from_rotation,
     omega_phi_kappa_jacobian,
     rotation_from_omega_phi_kappa,
@@ -98,3 +99,16 @@ def test_omega_phi_kappa_jacobian_by_finite_differences(omega: float, phi: float
         minus = omega_phi_kappa_from_rotation(rotation @ exp_so3(-step * unit))
         numeric[:, k] = ((plus - minus + np.pi) % (2.0 * np.pi) - np.pi) / (2.0 * step)
     np.testing.assert_allclose(omega_phi_kappa_jacobian(rotation), numeric, atol=2e-7)
+
+
+@pytest.mark.parametrize("heading_deg", [0.0, 37.0, 90.0, -135.0, 179.0])
+@pytest.mark.parametrize("pitch_deg", [0.0, -60.0, 83.0, -83.0])
+@pytest.mark.parametrize("roll_deg", [0.0, 25.0])
+def test_a_heading_is_the_yaw(heading_deg: float, pitch_deg: float, roll_deg: float) -> None:
+    rotation = rotation_from_yaw_pitch_roll(np.radians([heading_deg, pitch_deg, roll_deg]))
+    assert np.degrees(heading_of(rotation)) == pytest.approx(heading_deg)
+
+
+@pytest.mark.parametrize("pitch_deg", [85.0, -85.0, 90.0, -90.0])
+def test_what_looks_up_or_down_has_no_heading(pitch_deg: float) -> None:
+    assert np.isnan(heading_of(rotation_from_yaw_pitch_roll(np.radians([37.0, pitch_deg, 0.0]))))

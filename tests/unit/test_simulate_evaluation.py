@@ -11,8 +11,9 @@ import pytest
 from georef.errors import ConfigError, InputError
 from georef.features.images import read_image
 from georef.features.panorama import cut_head
+from georef.geometry.angles import rotation_from_yaw_pitch_roll
 from georef.geometry.panorama import directions_from_head, head_from_directions
-from georef.geometry.rigid import log_so3
+from georef.geometry.rigid import Rigid3, log_so3
 from georef.io.exif import size_and_focal
 from georef.io.exterior_orientation import read_exterior_orientation
 from georef.project import Project, open_project
@@ -29,6 +30,7 @@ from georef.simulate.evaluation import (
 from georef.simulate.evaluation_files import PRIORS, project_toml, write_evaluation_images, write_evaluation_tables
 from georef.simulate.evaluation_images import panorama_layout, products
 from georef.simulate.project_files import TRUTH
+from georef.simulate.tables import position_table
 from georef.simulate.world import small_options
 from georef.stages.demo import demo_options
 from georef.stages.survey import load_survey
@@ -192,3 +194,14 @@ def test_an_interrupted_writing_goes_on(world: EvaluationWorld, folder: Path) ->
 def test_the_project_in_the_repository_is_the_one_that_is_written() -> None:
     written = (Path(__file__).parents[2] / "projects" / "evaluation" / "project.toml").read_text(encoding="utf-8")
     assert written == project_toml(EvaluationWorld(evaluation_options(0)))
+
+
+def test_a_view_straight_down_has_an_empty_heading(world: EvaluationWorld) -> None:
+    rotations = [rotation_from_yaw_pitch_roll(np.radians([30.0, pitch_deg, 0.0])) for pitch_deg in (0.0, -90.0)]
+    poses = [Rigid3(rotation, np.zeros(3)) for rotation in rotations]
+    system = next(iter(PRIORS.values()))
+    positions, headings = drawn_positions(world, poses, system, "down")
+    text = position_table(dict(zip("ab", positions, strict=True)), system.sigmas_m, headings, {}, world.frame)
+    level, down = text.splitlines()[-2:]
+    assert float(level.rsplit(",", 1)[1]) == pytest.approx(headings[0], abs=0.01)
+    assert down.endswith(",")
