@@ -23,6 +23,7 @@ from georef.features.images import UnreadableImage, read_image
 from georef.features.registry import GLOBAL_DESCRIPTORS, load_component
 from georef.geometry.angles import heading_of
 from georef.stages.base import StageContext, StageSummary, feature_id, open_features
+from georef.stages.failures import internal_failure
 from georef.stages.features import failed_images
 from georef.store.vector_index import IndexRow, VectorIndex
 from georef.types.campaign import Image
@@ -84,8 +85,12 @@ class DescribeTask:
             made.learn(_Contents(made.needs, sample, self.store_folder)).save(self.state_path)
 
     def __call__(self, image: Image) -> Row | None:
-        for content in _Contents(self.descriptor.needs, [image], self.store_folder):
-            return self.describe(content)
+        descriptor = self.descriptor  # what is wrong with it is wrong for all images
+        try:
+            for content in _Contents(descriptor.needs, [image], self.store_folder):
+                return self.describe(content)
+        except Exception as error:
+            internal_failure(error, f"the global descriptor of {image.image_id}")
         return None
 
     def describe(self, content: Any) -> Row:
@@ -95,7 +100,7 @@ class DescribeTask:
 
 @dataclass(frozen=True)
 class _Contents:
-    """What a descriptor looks at in each image, read as it is gone through; what cannot be read is left out."""
+    """What a descriptor looks at in each image, read as it is gone through; damaged files are left out."""
 
     needs: Needs
     images: Sequence[Image]
@@ -108,8 +113,8 @@ class _Contents:
                     yield read_image(image.path)
                 else:
                     yield open_features(self.store_folder).read(feature_id(image))
-            except UnreadableImage as error:
-                logger.warning("%s cannot be described: %s", image.image_id, error.problem)
+            except (UnreadableImage, StageError) as error:
+                logger.warning("%s cannot be described: %s", image.image_id, error)
 
 
 @dataclass(frozen=True, eq=False)

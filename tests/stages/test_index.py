@@ -68,3 +68,15 @@ def test_a_damaged_state_names_its_file(copied: Callable[..., Bench]) -> None:
     shutil.rmtree(bench.states()["localize"].folder)
     with pytest.raises(StageError, match=r"(?s)damaged.*descriptor\.safetensors"):
         bench.run()
+
+
+def test_one_damaged_file_of_features_leaves_the_others_in(copied: Callable[..., Bench]) -> None:
+    bench = copied()
+    task, folder = task_of(bench)
+    damaged = next(task.store_folder.glob("reference*.safetensors"))
+    damaged.write_bytes(damaged.read_bytes()[:200])
+    project = bench.open()
+    survey = load_survey(project, EPOCH)
+    rows = [task(image) for image in survey.reference.images]
+    assert sum(row is None for row in rows) == 1
+    assert folder.is_dir()
