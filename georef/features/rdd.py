@@ -13,7 +13,8 @@ from georef.features.base import Detections, Image
 from georef.features.device import choose_device
 from georef.features.peaks import find_peaks
 from georef.features.rdd_network import MULTIPLE, RddNetwork, sample_cells
-from georef.features.weights import load_state_dict, version_tag
+from georef.features.torch_extractor import detections_of, image_tensor, version_of
+from georef.features.weights import load_state_dict
 
 
 class Rdd:
@@ -37,22 +38,16 @@ class Rdd:
 
     def version(self) -> str:
         settings = f"threshold={self._threshold} device={self._device.type}"
-        return f"{self.name}-1 torch={torch.__version__} weights={version_tag(self.weights)} {settings}"
+        return version_of(self.name, self.weights, settings)
 
     def detect(self, image_rgb: Image, max_keypoints: int) -> Detections:
         """Keypoints of an image (H, W, 3); scores are the network's, in (0, 1); the scale is one pixel of the level."""
         filled = (_up(image_rgb.shape[1]), _up(image_rgb.shape[0]))
         with torch.inference_mode():
-            pixels = torch.from_numpy(np.ascontiguousarray(image_rgb)).to(self._device)
-            cells, score_map = self._network.dense(pixels.permute(2, 0, 1).float() / 255)
+            cells, score_map = self._network.dense(image_tensor(image_rgb, self._device))
             keypoints, scores = find_peaks(score_map, self._threshold, max_keypoints)
             descriptors = sample_cells(cells, keypoints, filled)
-        return Detections(
-            keypoints_px=keypoints.cpu().numpy() + np.float32(0.5),  # the network: top-left pixel's centre at (0, 0)
-            scores=scores.cpu().numpy(),
-            scales_px=np.ones(len(scores), np.float32),
-            descriptors=descriptors.half().cpu().numpy(),
-        )
+        return detections_of(keypoints, scores, descriptors)
 
 
 def _up(side: int) -> int:

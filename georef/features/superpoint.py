@@ -13,7 +13,8 @@ from torch.nn.functional import conv2d, grid_sample, max_pool2d, normalize, pad,
 from georef.features.base import Detections, Image
 from georef.features.device import choose_device
 from georef.features.peaks import parabola_offsets, pixels_of, strict_maxima
-from georef.features.weights import load_state_dict, version_tag
+from georef.features.torch_extractor import detections_of, image_tensor, version_of
+from georef.features.weights import load_state_dict
 
 _CELL = 8  # pixels; one descriptor and 64 scores each
 _GREY = (0.299, 0.587, 0.114)
@@ -76,21 +77,15 @@ class SuperPoint:
 
     def version(self) -> str:
         settings = f"threshold={self._threshold} subpixel={self._subpixel} device={self._device.type}"
-        return f"{self.name}-1 torch={torch.__version__} weights={version_tag(self.weights)} {settings}"
+        return version_of(self.name, self.weights, settings)
 
     def detect(self, image_rgb: Image, max_keypoints: int) -> Detections:
         """Keypoints of an image (H, W, 3), 4 px or more from its border; scores are the network's, in (0, 1)."""
         with torch.inference_mode():
-            pixels = torch.from_numpy(np.ascontiguousarray(image_rgb)).to(self._device)
-            cells, score_map = self._network.dense(pixels.permute(2, 0, 1).float() / 255)
+            cells, score_map = self._network.dense(image_tensor(image_rgb, self._device))
             index = strict_maxima(score_map, self._threshold, max_keypoints, self.nms_radius_px)
             whole = pixels_of(index, score_map.shape[1])
             descriptors = describe(cells, whole)
             keypoints = whole + parabola_offsets(score_map.log(), index) if self._subpixel else whole
             scores = score_map.reshape(-1)[index]
-        return Detections(
-            keypoints_px=keypoints.cpu().numpy() + np.float32(0.5),  # the network: top-left pixel's centre at (0, 0)
-            scores=scores.cpu().numpy(),
-            scales_px=np.ones(len(scores), np.float32),
-            descriptors=descriptors.half().cpu().numpy(),
-        )
+        return detections_of(keypoints, scores, descriptors)

@@ -19,6 +19,7 @@ from georef.estimation.reference_network import (
 from georef.geometry.rigid import Rigid3
 from georef.io.files import write_text_atomically
 from georef.stages.base import StageContext, StageSummary, feature_id, open_features
+from georef.stages.features import failed_images
 from georef.types.campaign import Image
 from georef.types.results import ReferenceNoise
 
@@ -71,8 +72,7 @@ def read_noise(folder: Path) -> tuple[ReferenceNoise, tuple[str, ...]]:
 
 
 def _usable_reference(context: StageContext) -> list[Image]:
-    failed = context.before["features"] / "stage.json"
-    skipped = json.loads(failed.read_text(encoding="utf-8"))["data"]["failed"]
+    skipped = failed_images(context.before["features"])
     usable = [image for image in context.survey.reference.images if feature_id(image) not in skipped]
     if len(usable) < 2:
         raise StageError(
