@@ -135,6 +135,7 @@ def _to_full_resolution(found: Detections, level: Image, image_size: tuple[int, 
     column, row = np.clip(keypoints.astype(np.int64), 0, np.array(level_size_px) - 1).T
     full = resize_keypoints(keypoints, from_size=level_size_px, to_size=image_size)
     enlargement = max(image_size) / max(level_size_px)
+    orientations = found.orientations_rad
     return Features(
         image_size=image_size,
         keypoints_px=full.astype(np.float32),
@@ -142,6 +143,7 @@ def _to_full_resolution(found: Detections, level: Image, image_size: tuple[int, 
         scales_px=found.scales_px[order] * np.float32(enlargement),
         descriptors=found.descriptors[order],
         colors_rgb=level[row, column],
+        orientations_rad=None if orientations is None else orientations[order],
     )
 
 

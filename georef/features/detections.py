@@ -21,18 +21,25 @@ class Detections:
     scores: NDArray[np.float32]  # (N,)
     scales_px: NDArray[np.float32]  # (N,) size of what was localised: its noise scales with it
     descriptors: Descriptors  # (N, D)
+    orientations_rad: NDArray[np.float32] | None = None  # (N,) from x towards y, in (-pi, pi]; None: not detected
 
     def take(self, indices: NDArray[np.integer]) -> Detections:
         return Detections(
-            self.keypoints_px[indices], self.scores[indices], self.scales_px[indices], self.descriptors[indices]
+            self.keypoints_px[indices],
+            self.scores[indices],
+            self.scales_px[indices],
+            self.descriptors[indices],
+            None if self.orientations_rad is None else self.orientations_rad[indices],
         )
 
     @staticmethod
     def joined(parts: Sequence[Detections]) -> Detections:
-        """All detections of one or more parts, in their order."""
+        """All detections of one or more parts of one extractor, in their order."""
+        orientations = [part.orientations_rad for part in parts if part.orientations_rad is not None]
         return Detections(
             np.concatenate([part.keypoints_px for part in parts]),
             np.concatenate([part.scores for part in parts]),
             np.concatenate([part.scales_px for part in parts]),
             cast(Descriptors, np.concatenate([part.descriptors for part in parts])),
+            np.concatenate(orientations) if orientations else None,
         )

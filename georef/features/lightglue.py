@@ -6,15 +6,18 @@ from typing import Literal, get_args
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from georef.errors import ConfigError
 from georef.features.device import choose_device
 from georef.features.lightglue_network import LightGlueNetwork
+from georef.features.nearest import unit_rows
 from georef.features.weights import load_state_dict, version_tag
 from georef.types.features import Features, Matches
 
 Precision = Literal["auto", "float32", "bfloat16"]
+SIFT_SIDE_PX = 1024  # longest side of the images that LightGlue for SIFT was trained with
 
 
 class LightGlue:
@@ -56,21 +59,32 @@ class LightGlue:
 
     def match(self, a: Features, b: Features) -> Matches:
         """Matches of features of one of `extractors`; scores are the network's, in (0, 1]."""
-        if self._max_keypoints is not None:
-            a, b = a.head(self._max_keypoints), b.head(self._max_keypoints)
-        if len(a) == 0 or len(b) == 0:
+        chosen_a, chosen_b = (self._suitable(features)[: self._max_keypoints] for features in (a, b))
+        if len(chosen_a) == 0 or len(chosen_b) == 0:
             return Matches.empty()
         with torch.inference_mode():
-            return _mutual_matches(self._network.log_assignment(*self._inputs(a), *self._inputs(b)), self._min_score)
+            inputs = (*self._inputs(a.take(chosen_a)), *self._inputs(b.take(chosen_b)))
+            found = _mutual_matches(self._network.log_assignment(*inputs), self._min_score)
+        indices = np.stack([chosen_a[found.indices[:, 0]], chosen_b[found.indices[:, 1]]], 1)
+        return Matches(indices, found.scores)
+
+    def _suitable(self, features: Features) -> NDArray[np.int32]:
+        """Indices of the features that may be matched, the best first."""
+        return np.arange(len(features), dtype=np.int32)
 
     def _inputs(self, features: Features) -> tuple[Tensor, Tensor]:
-        """Places (N, 2) from the image's centre in units of half its longest side, and descriptors (N, D), float32."""
+        """Places (N, P) and descriptors (N, D), float32."""
+        inputs = self._places(features), self._rows(features)
+        return torch.from_numpy(inputs[0]).to(self._device), torch.from_numpy(inputs[1]).to(self._device)
+
+    def _places(self, features: Features) -> NDArray[np.float32]:
+        """Keypoints (N, 2) from the image's centre in units of half its longest side."""
         size = np.array(features.image_size, np.float32)
-        places = (features.keypoints_px - size / 2) / (size.max() / 2)
-        return (
-            torch.from_numpy(places).to(self._device),
-            torch.from_numpy(features.descriptors.astype(np.float32)).to(self._device),
-        )
+        return (features.keypoints_px - size / 2) / (size.max() / 2)
+
+    def _rows(self, features: Features) -> NDArray[np.float32]:
+        """Descriptors (N, D) as the weights were trained with them."""
+        return features.descriptors.astype(np.float32)
 
 
 class LightGlueAliked(LightGlue):
@@ -83,6 +97,35 @@ class LightGlueDisk(LightGlue):
     name = "lightglue-disk"
     extractors = ("disk",)
     weights = "disk_lightglue"
+
+
+class LightGlueSift(LightGlue):
+    """Sees the scale and orientation of each keypoint too, as COLMAP has them, whose SIFT it was trained with: the
+    sigma in pixels of an image with a longest side of 1024, and the angle from x towards y.
+
+    Of several orientations at one place the one nearest to zero is matched: training knew one a place. `match` raises
+    ValueError for features without orientations.
+    """
+
+    name = "lightglue-sift"
+    extractors = ("sift",)
+    weights = "sift_lightglue"
+
+    def _suitable(self, features: Features) -> NDArray[np.int32]:
+        if len(features) == 0:
+            return super()._suitable(features)
+        turned = np.abs(_orientations(features))
+        order = np.lexsort((turned, *features.keypoints_px.T))
+        places = features.keypoints_px[order]
+        first = np.concatenate([[True], (places[1:] != places[:-1]).any(1)])
+        return np.sort(order[first]).astype(np.int32)
+
+    def _places(self, features: Features) -> NDArray[np.float32]:
+        scales = features.scales_px * np.float32(SIFT_SIDE_PX / max(features.image_size))
+        return np.column_stack([super()._places(features), scales, _orientations(features)])
+
+    def _rows(self, features: Features) -> NDArray[np.float32]:
+        return unit_rows(features.descriptors)
 
 
 class LightGlueSuperPoint(LightGlue):
@@ -113,6 +156,12 @@ def _best_precision(device: torch.device) -> Precision:
         return "bfloat16" if torch.cuda.is_bf16_supported(including_emulation=False) else "float32"
     has_units = getattr(torch.cpu, "_is_amx_tile_supported", None)  # not public yet
     return "bfloat16" if has_units is not None and has_units() else "float32"
+
+
+def _orientations(features: Features) -> NDArray[np.float32]:
+    if features.orientations_rad is None:
+        raise ValueError("expected features with orientations, as SIFT has them")
+    return features.orientations_rad
 
 
 def _mutual_matches(log_scores: Tensor, min_score: float) -> Matches:

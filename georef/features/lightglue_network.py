@@ -30,8 +30,8 @@ class LightGlueNetwork:
     def log_assignment(self, places_a: Tensor, rows_a: Tensor, places_b: Tensor, rows_b: Tensor) -> Tensor:
         """Logarithm (N, M) of the score of every pair, float32.
 
-        places (N, 2), (M, 2): keypoints from the image's centre in units of half its longest side. rows (N, D), (M, D):
-        descriptors of unit length.
+        places (N, P), (M, P): keypoints from the image's centre in units of half its longest side; where the weights
+        want P = 4, also their scales and orientations. rows (N, D), (M, D): descriptors of unit length.
         """
         turn_a, turn_b = self._turns(places_a), self._turns(places_b)
         a, b = (self._projected(rows.to(self._dtype)) for rows in (rows_a, rows_b))

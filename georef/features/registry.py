@@ -65,6 +65,7 @@ MATCHERS = ComponentTable(
         "lightglue-aliked": "georef.features.lightglue:LightGlueAliked",
         "lightglue-disk": "georef.features.lightglue:LightGlueDisk",
         "lighterglue-xfeat": "georef.features.lightglue:LighterGlue",
+        "lightglue-sift": "georef.features.lightglue:LightGlueSift",
         "lightglue-superpoint": "georef.features.lightglue:LightGlueSuperPoint",
         "lightglue-rdd": "georef.features.lightglue:LightGlueRdd",
     },

@@ -28,11 +28,12 @@ class Sift:
 
     def version(self) -> str:
         return (
-            f"sift-rootsift-1 opencv={cv2.__version__} contrast={self._contrast_threshold} edge={self._edge_threshold}"
+            f"sift-rootsift-2 opencv={cv2.__version__} contrast={self._contrast_threshold} edge={self._edge_threshold}"
         )
 
     def detect(self, image_rgb: Image, max_keypoints: int) -> Detections:
-        """Keypoints of an image (H, W, 3); scores are the contrast of the extremum, scales its sigma in pixels."""
+        """Keypoints of an image (H, W, 3); scores are the contrast of the extremum, scales its sigma in pixels,
+        orientations the directions of the strongest gradients."""
         grey = cv2.cvtColor(image_rgb, cv2.COLOR_RGB2GRAY)
         found, descriptors = self._detector(max_keypoints).detectAndCompute(grey, None)
         if descriptors is None or not found:
@@ -41,8 +42,9 @@ class Sift:
                 np.zeros(0, np.float32),
                 np.zeros(0, np.float32),
                 root_sift(np.zeros((0, 128))),
+                np.zeros(0, np.float32),
             )
-        values = np.array([(*p.pt, p.response, p.size) for p in found], np.float32)
+        values = np.array([(*p.pt, p.response, p.size, p.angle) for p in found], np.float32)
         best = np.argsort(-values[:, 2], kind="stable")[:max_keypoints]  # OpenCV keeps ties beyond the budget
         values = values[best]
         return Detections(
@@ -50,6 +52,7 @@ class Sift:
             scores=values[:, 2].copy(),
             scales_px=values[:, 3] * np.float32(0.5),  # OpenCV's size is a diameter
             descriptors=root_sift(np.asarray(descriptors, np.float32)[best]),
+            orientations_rad=np.deg2rad(180 - (180 - values[:, 4]) % 360),  # OpenCV: degrees in [0, 360)
         )
 
     def _detector(self, max_keypoints: int) -> cv2.SIFT:

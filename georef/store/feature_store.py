@@ -31,10 +31,10 @@ class FeatureStore:
     written under a temporary name and then put in place as a whole.
 
     quantize: descriptors of real numbers are kept in seven bits a value, and scores in float16; the cosine between a
-    descriptor and what is read back is 1 - 1e-4, its length is kept, keypoints, scales and colours are exact. Features
-    come back in the types that they had. 1,024 of them with 128 values and one scale take 133 KB. False keeps
-    everything exactly. Where a version is given, images stored the other way count as missing; without one, both are
-    read.
+    descriptor and what is read back is 1 - 1e-4, its length is kept, keypoints, scales, orientations and colours are
+    exact. Features come back in the types that they had. 1,024 of them with 128 values, one scale and no orientations
+    take 133 KB. False keeps everything exactly. Where a version is given, images stored the other way count as missing;
+    without one, both are read.
     """
 
     def __init__(self, folder: Path, *, extractor_version: str | None = None, quantize: bool = True) -> None:

@@ -23,6 +23,7 @@ class Features:
     ]  # (N,) size in full-resolution pixels of what the detector localised: its noise scales with it
     descriptors: NDArray[np.float32] | NDArray[np.float16] | NDArray[np.uint8]  # (N, D)
     colors_rgb: NDArray[np.uint8]  # (N, 3)
+    orientations_rad: NDArray[np.float32] | None = None  # (N,) from x towards y, in (-pi, pi]; None: not detected
 
     def __len__(self) -> int:
         return len(self.keypoints_px)
@@ -39,6 +40,7 @@ class Features:
             self.scales_px[indices],
             self.descriptors[indices],
             self.colors_rgb[indices],
+            None if self.orientations_rad is None else self.orientations_rad[indices],
         )
 
 

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Iterable
+from functools import partial
 from pathlib import Path
 
 import torch
@@ -84,10 +86,12 @@ def rdd_weights(seed: int = 0, layers: int = 1) -> dict[str, Tensor]:
     return maker.made
 
 
-def lightglue_weights(seed: int = 0) -> dict[str, Tensor]:
-    """For descriptors of 256, the width of the layers: there is no projection of the input."""
+def lightglue_weights(seed: int = 0, *, descriptor_size: int = 256, places: int = 2) -> dict[str, Tensor]:
+    """Descriptors of 256, the width of the layers, are not projected; places: 2 for x, y, 4 with scale, orientation."""
     maker = Maker(seed)
-    maker.normal("posenc.Wr.weight", 32, 2, scale=1.0)
+    maker.normal("posenc.Wr.weight", 32, places, scale=1.0)
+    if descriptor_size != 256:
+        maker.linear("input_proj", 256, descriptor_size)
     for layer in range(9):
         own, cross = f"self_attn.{layer}", f"cross_attn.{layer}"
         maker.linear(f"{own}.Wqkv", 768, 256, scale=0.06)
@@ -100,6 +104,8 @@ def lightglue_weights(seed: int = 0) -> dict[str, Tensor]:
             maker.linear(f"{name}.ffn.3", 256, 512, scale=0.04)
         maker.linear(f"log_assignment.{layer}.matchability", 1, 256, scale=0.06)
         maker.linear(f"log_assignment.{layer}.final_proj", 256, 256, scale=0.06)
+        if layer < 8:
+            maker.linear(f"token_confidence.{layer}.token.0", 1, 256, scale=0.06)
     return maker.made
 
 
@@ -108,14 +114,15 @@ MADE = {
     "rdd-v2": rdd_weights,
     "superpoint_lightglue": lightglue_weights,
     "rdd_lightglue-v2": lightglue_weights,
+    "sift_lightglue": partial(lightglue_weights, descriptor_size=128, places=4),
 }
 
 
-def put_into_cache(folder: Path) -> None:
-    """Bring all of them into the cache that GEOREF_CACHE names, the way a user brings a file."""
-    for name, make in MADE.items():
+def put_into_cache(folder: Path, names: Iterable[str] = MADE) -> None:
+    """Bring them into the cache that GEOREF_CACHE names, the way a user brings a file."""
+    for name in names:
         path = folder / f"{name}.pth"
-        torch.save(make(), path)
+        torch.save(MADE[name](), path)
         sha256 = hashlib.sha256(path.read_bytes()).hexdigest()
         fetch([name], file=path, sha256=sha256, accept_licence=True)
 

@@ -42,6 +42,10 @@ def _assert_valid(features: Features, extractor: Extractor, image_size: tuple[in
     assert (features.keypoints_px >= 0).all()
     assert (features.keypoints_px <= np.array(image_size)).all()
     assert np.isfinite(features.descriptors.astype(np.float32)).all()
+    if features.orientations_rad is not None:
+        assert features.orientations_rad.shape == (count,)
+        assert features.orientations_rad.dtype == np.float32
+        assert (np.abs(features.orientations_rad) <= np.float32(np.pi)).all()
 
 
 def test_a_textured_image_fills_the_budget(extractor: Extractor) -> None:
@@ -88,7 +92,7 @@ def test_levels_beyond_what_it_takes_at_once(extractor: Extractor) -> None:
 def test_twice_the_same(extractor: Extractor) -> None:
     image = textured_image(333, 251)
     first, second = (extract_features(extractor, image, 1024, 200) for _ in range(2))
-    for name in ("keypoints_px", "scores", "scales_px", "descriptors", "colors_rgb"):
+    for name in ("keypoints_px", "scores", "scales_px", "descriptors", "colors_rgb", "orientations_rad"):
         np.testing.assert_array_equal(getattr(first, name), getattr(second, name))
 
 
@@ -146,6 +150,22 @@ def test_a_mirrored_image_has_mirrored_keypoints(extractor: Extractor) -> None:
         offsets = nearest_offsets(turned, straight, within_px=1)
         assert len(offsets) > 200
         assert np.abs(np.median(offsets, axis=0)).max() < 0.05
+
+
+def test_orientations_turn_with_the_image(extractor: Extractor) -> None:
+    """A quarter turn clockwise adds 90 degrees to angles from x towards y."""
+    image = textured_image(400, 300, seed=7)
+    straight = extract_features(extractor, image, 1024, 300)
+    if straight.orientations_rad is None:
+        pytest.skip(f"{extractor.name} detects no orientations")
+    turned = extract_features(extractor, np.ascontiguousarray(np.rot90(image, -1)), 1024, 300)
+    assert turned.orientations_rad is not None
+    there = np.stack([300 - straight.keypoints_px[:, 1], straight.keypoints_px[:, 0]], 1)
+    near = np.linalg.norm(there[:, None] - turned.keypoints_px[None], axis=2) < 0.5
+    angles = turned.orientations_rad[None] - straight.orientations_rad[:, None] - np.pi / 2
+    apart = np.where(near, np.abs(np.angle(np.exp(1j * angles))), np.inf).min(1)
+    assert near.any(1).sum() > 200
+    assert np.mean(apart[near.any(1)] < 0.1) > 0.9
 
 
 @pytest.mark.parametrize("sigma_px", [1.5, 3.0])

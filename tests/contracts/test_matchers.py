@@ -31,9 +31,9 @@ def features_of(matcher: Matcher, component: Component) -> Of:
     def make(count: int, seed: int = 0) -> Features:
         if fitting is None:
             return _random_features(count, 128, seed)
-        size = EXTRACTORS.resolve(fitting[0]).load().descriptor_size
-        if getattr(matcher, "weights", None) in MADE:
-            return _random_features(count, size, seed)
+        extractor = EXTRACTORS.resolve(fitting[0]).load()
+        if getattr(extractor, "weights", None) in MADE:
+            return _random_features(count, extractor.descriptor_size, seed)
         found = extract_features(component(EXTRACTORS, fitting[0]), textured_image(640, 480, seed), 640, 300)
         assert len(found) >= count
         return found.head(count)

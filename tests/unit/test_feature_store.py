@@ -115,6 +115,23 @@ def test_scores_beyond_float16_stay_exact(store: FeatureStore, source: Path, cou
     _assert_same(store.read("a"), features)
 
 
+@pytest.mark.parametrize("count", [0, 1, 500])
+def test_orientations_are_kept_where_there_are_any(
+    store: FeatureStore, exact: FeatureStore, source: Path, count: int
+) -> None:
+    features = _features(count)
+    turns = np.random.default_rng(1).uniform(-np.pi, np.pi, count).astype(np.float32)
+    for kept in (store, exact):
+        kept.write("a", replace(features, orientations_rad=turns), source)
+        found = kept.read("a").orientations_rad
+        assert found is not None
+        assert found.dtype == np.float32
+        np.testing.assert_array_equal(found, turns)
+        np.testing.assert_array_equal(kept.read("a", 20).orientations_rad, turns[:20])
+        kept.write("a", features, source)
+        assert kept.read("a").orientations_rad is None
+
+
 @pytest.mark.parametrize("different", [1, 2, 256, 257])
 def test_scales_are_exact(store: FeatureStore, source: Path, different: int) -> None:
     scales = (np.arange(500) % different + 0.1).astype(np.float32)
