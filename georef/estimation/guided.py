@@ -18,6 +18,8 @@ from georef.geometry.rigid import Array, Rigid3, skew
 from georef.types.features import Features, Matches
 
 _ROUNDING = 1.001  # of single precision
+_NEVER = -2.0  # below any cosine
+_DENSE_SHARE = 0.02  # of all pairs that are similar: beyond it the band itself is found at less cost
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,6 +73,11 @@ class GuidedOptions:
     min_similarity: float  # cosine of descriptors
     ratio: float  # best descriptor distance over the second best in the band
 
+    @property
+    def least_rival(self) -> float:
+        """The least similarity of a second best that can make a match ambiguous."""
+        return 1.0 - (1.0 - self.min_similarity) / self.ratio**2
+
 
 def essential_matrix(a: PosedFeatures, b: PosedFeatures) -> Array:
     """E (3, 3) with d_b^T E d_a = 0 for rays d of one point. Hartley and Zisserman (2004), section 9.6."""
@@ -85,21 +92,51 @@ def guided_matches(a: PosedFeatures, b: PosedFeatures, options: GuidedOptions, k
     """
     if len(a.features) == 0 or len(b.features) == 0:
         return Matches.empty()
-    allowed = epipolar_band(a, b, options.gate)
     kept = known or Matches.empty()
-    in_band = allowed[kept.indices[:, 0], kept.indices[:, 1]]
+    in_band = within_band(a, b, kept.indices, options.gate)
     kept = Matches(kept.indices[in_band], kept.scores[in_band])
-    allowed[kept.indices[:, 0], :] = False
-    allowed[:, kept.indices[:, 1]] = False
-    cosine = np.where(allowed, similarity(a.features.descriptors, b.features.descriptors), -1.0)
-    best_b = cosine.argmax(axis=1)
-    best_a = cosine.argmax(axis=0)
-    rows = np.arange(len(cosine))
-    score = cosine[rows, best_b]
-    keep = (best_a[best_b] == rows) & (score >= options.min_similarity)
-    keep &= _distinct(cosine, rows, best_b, score, options.ratio)
-    pairs = np.column_stack([rows[keep], best_b[keep]]).astype(np.int32)
-    return Matches(np.concatenate([kept.indices, pairs]), np.concatenate([kept.scores, score[keep].astype(np.float32)]))
+    cosine = similarity(a.features.descriptors, b.features.descriptors)
+    cosine[kept.indices[:, 0], :] = _NEVER
+    cosine[:, kept.indices[:, 1]] = _NEVER
+    pairs = _similar_in_band(a, b, cosine, options)
+    score = cosine[pairs[:, 0], pairs[:, 1]]
+    best = mutual_best(pairs, score, options)
+    indices = np.concatenate([kept.indices, pairs[best].astype(np.int32)])
+    return Matches(indices, np.concatenate([kept.scores, score[best]]))
+
+
+def _similar_in_band(
+    a: PosedFeatures, b: PosedFeatures, cosine: NDArray[np.float32], options: GuidedOptions
+) -> NDArray[np.int64]:
+    """Pairs (K, 2) in the band that are a match or a rival of one, by their similarities (N, M)."""
+    similar = cosine >= max(options.least_rival, -1.0)
+    if np.count_nonzero(similar) > _DENSE_SHARE * similar.size:
+        similar &= _nearly_in_band(a, b, options.gate)
+    pairs = np.column_stack(np.divmod(np.flatnonzero(similar.ravel()), cosine.shape[1]))
+    return pairs[within_band(a, b, pairs, options.gate)]
+
+
+def mutual_best(pairs: NDArray[np.integer], score: NDArray[np.float32], options: GuidedOptions) -> NDArray[np.int64]:
+    """Which pairs (K, 2) are the most similar ones of both their members, and clearly so for the first member.
+
+    The pairs must include all that are at least `options.least_rival` similar and otherwise allowed.
+    """
+    by_first = np.lexsort((pairs[:, 1], -score, pairs[:, 0]))
+    by_second = np.lexsort((pairs[:, 0], -score, pairs[:, 1]))
+    best_of_second = np.zeros(len(pairs), bool)
+    best_of_second[by_second[_starts(pairs[by_second, 1])]] = True
+    start = _starts(pairs[by_first, 0])
+    best = by_first[start]
+    rival = np.full(len(best), -1.0, np.float32)
+    has_rival = np.diff(np.append(start, len(pairs))) > 1
+    rival[has_rival] = score[by_first[start[has_rival] + 1]]
+    distinct = np.maximum(1.0 - score[best], 0.0) <= options.ratio**2 * np.maximum(1.0 - rival, 1e-9)
+    return best[distinct & best_of_second[best] & (score[best] >= options.min_similarity)]
+
+
+def _starts(sorted_values: NDArray[np.integer]) -> NDArray[np.int64]:
+    """Where runs of equal values begin."""
+    return np.flatnonzero(np.diff(sorted_values, prepend=-1))
 
 
 def epipolar_distances(a: PosedFeatures, b: PosedFeatures, indices: NDArray[np.integer]) -> Array:
@@ -119,16 +156,21 @@ def epipolar_distances(a: PosedFeatures, b: PosedFeatures, indices: NDArray[np.i
         return off[:, None] / np.column_stack(rates)
 
 
-def epipolar_band(a: PosedFeatures, b: PosedFeatures, gate: float) -> NDArray[np.bool_]:
-    """(N, M) pairs whose distance from each other's epipolar curve is at most `gate` keypoint scales in both images.
+def within_band(a: PosedFeatures, b: PosedFeatures, pairs: NDArray[np.integer], gate: float) -> NDArray[np.bool_]:
+    """Whether keypoints (M, 2) lie within `gate` keypoint scales of each other's epipolar curves, in both images.
 
-    Images from one place have no epipolar planes: no pair.
+    Images from one place have no epipolar planes: no pair does.
     """
+    limits = gate * np.column_stack([a.features.scales_px[pairs[:, 0]], b.features.scales_px[pairs[:, 1]]])
+    return (epipolar_distances(a, b, pairs) <= limits).all(axis=1)
+
+
+def epipolar_band(a: PosedFeatures, b: PosedFeatures, gate: float) -> NDArray[np.bool_]:
+    """(N, M) pairs within `gate` keypoint scales of each other's epipolar curves in both images (`within_band`)."""
     near = _nearly_in_band(a, b, gate)
     pairs = np.argwhere(near)
-    limits = gate * np.column_stack([a.features.scales_px[pairs[:, 0]], b.features.scales_px[pairs[:, 1]]])
-    inside = (epipolar_distances(a, b, pairs) <= limits).all(axis=1)
-    near[pairs[~inside, 0], pairs[~inside, 1]] = False
+    outside = pairs[~within_band(a, b, pairs, gate)]
+    near[outside[:, 0], outside[:, 1]] = False
     return near
 
 
@@ -152,11 +194,3 @@ def _largest_rate(bearings: Bearings) -> NDArray[np.float32]:
     half_trace = 0.5 * (square[:, 0, 0] + square[:, 1, 1])
     spread = np.hypot(0.5 * (square[:, 0, 0] - square[:, 1, 1]), square[:, 0, 1])
     return np.sqrt(half_trace + spread).astype(np.float32)
-
-
-def _distinct(cosine: Array, rows: NDArray[np.integer], best: NDArray[np.integer], score: Array, ratio: float) -> Array:
-    """Whether the second best of each row is farther by the ratio of descriptor distances."""
-    second = cosine.copy()
-    second[rows, best] = -1.0
-    runner_up = second.max(axis=1)
-    return np.maximum(1.0 - score, 0.0) <= ratio * ratio * np.maximum(1.0 - runner_up, 1e-9)
