@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from georef.estimation.guided import PosedFeatures
+from georef.estimation.reference_errors import ReferenceErrors
 from georef.geometry.angles import heading_of
 from georef.geometry.projection import Views
 from georef.geometry.rigid import Array, Rigid3
@@ -98,6 +99,14 @@ class ReferenceMap:
     def pose_cov(self, index: int) -> Array:
         """Covariance (6, 6) of a reference pose."""
         return given_pose_cov(self.images[index], self.noise)
+
+    def errors(self, indices: Sequence[int]) -> ReferenceErrors:
+        """The errors of reference poses; images of one station share theirs."""
+        images = [self.images[i] for i in indices]
+        stations = [None if image.station is None else (image.epoch, image.station) for image in images]
+        return ReferenceErrors.of_stations(
+            [self.poses[i] for i in indices], [self.pose_cov(i) for i in indices], stations
+        )
 
 
 def given_pose_cov(image: Image, noise: ReferenceNoise) -> Array:
