@@ -15,6 +15,7 @@ from georef.estimation.pnp import EstimatedPose, refit_pose
 from georef.estimation.reference_map import ReferenceMap
 from georef.estimation.search import Search
 from georef.estimation.timer import StepTimer
+from georef.estimation.weak_geometry import arrangement, weak_geometry, weakness
 from georef.features.base import Matcher
 from georef.geometry.camera import Camera
 from georef.geometry.rigid import Rigid3
@@ -79,15 +80,20 @@ def consensus(query: Query, model: LocalModel) -> FirstPose | Rejected:
 def outcome_of(query: Query, estimate: EstimatedPose | None, model: LocalModel, chosen: Sequence[int]) -> Outcome:
     image_id = query.image.image_id
     if estimate is None:
-        return Rejected(image_id, RejectReason.DEGENERATE, f"{len(model)} points do not fix the pose")
+        why = f": {', '.join(arrangement(query.observed, model))}" if len(model) else ""
+        return Rejected(image_id, RejectReason.DEGENERATE, f"{len(model)} points do not fix the pose{why}")
     inliers = int(estimate.inliers.sum())
     if not _enough(inliers, model, query.config):
         return Rejected(image_id, RejectReason.FEW_INLIERS, f"{inliers} of {len(model)} points agree with one pose")
+    used = model.take(estimate.inliers)
     sigma = float(np.sqrt(np.linalg.eigvalsh(estimate.cov[3:, 3:])[-1]))
     if sigma > query.config.max_position_sigma_m:
         limit = query.config.max_position_sigma_m
-        return Rejected(image_id, RejectReason.DEGENERATE, f"position sigma {sigma:.2f} m, over {limit:g} m")
-    used = model.take(estimate.inliers)
+        why = "; ".join([weakness(estimate.relative_cov).text, *arrangement(query.observed, used)])
+        detail = f"position sigma {sigma:.2f} m, over {limit:g} m: {why}"
+        return Rejected(image_id, RejectReason.DEGENERATE, detail)
+    if weak := weak_geometry(estimate.relative_cov, query.observed, used):
+        query.notes.append(weak)
     if 0 < query.config.max_correspondences < len(used):
         used, estimate = _thinned(query, used, estimate, chosen)
     return Localized(
@@ -118,7 +124,7 @@ def _thinned(
     order = np.random.default_rng(query.config.seed).permutation(len(model))
     model = model.take(np.isin(np.arange(len(model)), order[: query.config.max_correspondences]))
     observed = query.observed.with_camera(estimate.camera)
-    refined = refit_pose(estimate.world_from_cam, observed, model, lambda v: query.reference.pose_cov(chosen[v]))
+    refined = refit_pose(estimate.world_from_cam, observed, model, query.reference.errors(chosen))
     return model, refined or estimate
 
 
