@@ -80,6 +80,7 @@ class LocalizeConfig(Section):
     min_inlier_ratio: float = Field(default=0.1, ge=0, le=1)
     max_position_sigma_m: float = Field(default=1.0, gt=0)
     max_correspondences: int = Field(default=0, ge=0)
+    try_turned: bool = True
     seed: int = 0
 
 

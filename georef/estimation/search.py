@@ -46,16 +46,15 @@ class Search:
     def ranked(self, box: Box) -> tuple[NDArray[np.int64], str]:
         """References that may show what the query shows, the most promising first, and a note where some were left."""
         config = self.config
-        if config.ranking == "votes":
-            left = len(box.indices) - config.max_searched
-            which = "first" if self.where.centre is None else "nearest"
-            note = f"searched the {which} {config.max_searched} of {len(box.indices)} references" if left > 0 else ""
-            return self._by_votes(box.indices[: config.max_searched]), note
-        if self.find_similar is None:
-            raise ValueError(f"the ranking {config.ranking!r} needs a vector database")
-        count = config.count if config.ranking == "global" else config.shortlist
-        similar = self.find_similar(count, box, config)
-        return similar if config.ranking == "global" else self._by_votes(similar), ""
+        if config.ranking == "global":
+            return self._similar(config.count, box), ""
+        shortlist, note = self._shortlist(box)
+        return shortlist[np.argsort(-self._votes(shortlist), kind="stable")], note
+
+    def best_votes(self, box: Box) -> int:
+        """Votes of the references that have most, as many as a first pose is tried with."""
+        votes = np.sort(self._votes(self._shortlist(box)[0]))
+        return int(votes[-self.config.first_count :].sum())
 
     def with_neighbours(self, ranked: NDArray[np.int64], position: Array) -> NDArray[np.int64]:
         """The ranked references, then those nearest to a position (3,), which similarity may have missed."""
@@ -63,7 +62,21 @@ class Search:
         near = np.argsort(distance, kind="stable")[:_NEIGHBOURS_OF_A_POSE]
         return np.concatenate([ranked, near[~np.isin(near, ranked)]])
 
-    def _by_votes(self, indices: NDArray[np.int64]) -> NDArray[np.int64]:
+    def _shortlist(self, box: Box) -> tuple[NDArray[np.int64], str]:
+        """The references that votes are counted of, and a note where some were left."""
+        config = self.config
+        if config.ranking != "votes":
+            return self._similar(config.shortlist, box), ""
+        left = len(box.indices) - config.max_searched
+        which = "first" if self.where.centre is None else "nearest"
+        note = f"searched the {which} {config.max_searched} of {len(box.indices)} references" if left > 0 else ""
+        return box.indices[: config.max_searched], note
+
+    def _similar(self, count: int, box: Box) -> NDArray[np.int64]:
+        if self.find_similar is None:
+            raise ValueError(f"the ranking {self.config.ranking!r} needs a vector database")
+        return self.find_similar(count, box, self.config)
+
+    def _votes(self, indices: NDArray[np.int64]) -> NDArray[np.int64]:
         count = self.config.vote_keypoints
-        votes = vote(self.features.head(count), [self.reference.head(int(i), count) for i in indices])
-        return indices[np.argsort(-votes, kind="stable")]
+        return vote(self.features.head(count), [self.reference.head(int(i), count) for i in indices])

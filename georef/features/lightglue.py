@@ -64,9 +64,11 @@ class LightGlue:
             return _mutual_matches(self._network.log_assignment(*self._inputs(a), *self._inputs(b)), self._min_score)
 
     def _inputs(self, features: Features) -> tuple[Tensor, Tensor]:
-        """Places (N, 2) from the image's centre in units of half its longest side, and descriptors (N, D), float32."""
-        size = np.array(features.image_size, np.float32)
-        places = (features.keypoints_px - size / 2) / (size.max() / 2)
+        """Places (N, 2) from the centre in units of half the longest side of the picture, as it was turned when they
+        were found, and descriptors (N, D), float32."""
+        keypoints_px, image_size = features.as_found
+        size = np.array(image_size, np.float32)
+        places = (keypoints_px - size / 2) / (size.max() / 2)
         return (
             torch.from_numpy(places).to(self._device),
             torch.from_numpy(features.descriptors.astype(np.float32)).to(self._device),

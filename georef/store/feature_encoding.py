@@ -51,6 +51,7 @@ def encode(features: Features, quantize: bool) -> tuple[Arrays, dict[str, str]]:
         "encoding": QUANTIZED if quantize else EXACT,
         "descriptor_size": str(descriptors.shape[1]),
         "descriptor_dtype": descriptors.dtype.name,
+        "quarter_turns": str(features.quarter_turns),
     }
     return arrays, header
 
@@ -68,6 +69,7 @@ def decode(
         scales_px=_read_scales(arrays, len(keypoints)),
         descriptors=_read_descriptors(arrays, header),
         colors_rgb=arrays["colors_rgb"],
+        quarter_turns=int(header.get("quarter_turns", "0")),  # files written before it was said were not turned
     )
 
 

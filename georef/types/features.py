@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+
+from georef.geometry.pixels import turn_keypoints, turned_size
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,6 +25,9 @@ class Features:
     ]  # (N,) size in full-resolution pixels of what the detector localised: its noise scales with it
     descriptors: NDArray[np.float32] | NDArray[np.float16] | NDArray[np.uint8]  # (N, D)
     colors_rgb: NDArray[np.uint8]  # (N, 3)
+    quarter_turns: int = (
+        0  # clockwise, of the picture that they were found in; the keypoints are those of the image itself
+    )
 
     def __len__(self) -> int:
         return len(self.keypoints_px)
@@ -39,7 +44,20 @@ class Features:
             self.scales_px[indices],
             self.descriptors[indices],
             self.colors_rgb[indices],
+            self.quarter_turns,
         )
+
+    @property
+    def as_found(self) -> tuple[NDArray[np.float32], tuple[int, int]]:
+        """Keypoints (N, 2), and width and height, in the picture as it was turned when they were found."""
+        places = turn_keypoints(self.keypoints_px, size=self.image_size, quarter_turns=self.quarter_turns)
+        return places.astype(np.float32), turned_size(self.image_size, self.quarter_turns)
+
+    def turned_back(self, quarter_turns: int) -> Features:
+        """Features of a picture that was turned clockwise, as features of the image itself."""
+        places = turn_keypoints(self.keypoints_px, size=self.image_size, quarter_turns=-quarter_turns)
+        size, turns = turned_size(self.image_size, quarter_turns), (self.quarter_turns + quarter_turns) % 4
+        return replace(self, image_size=size, keypoints_px=places.astype(np.float32), quarter_turns=turns)
 
 
 @dataclass(frozen=True, eq=False)
