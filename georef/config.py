@@ -66,6 +66,7 @@ class CandidatesConfig(Section):
     shortlist: int = Field(default=50, ge=2)
     count: int = Field(default=10, ge=2)
     first_count: int = Field(default=4, ge=2)
+    target_sigma_m: float = Field(default=0.0, ge=0)
     vote_keypoints: int = Field(default=512, ge=16)
     max_searched: int = Field(default=2000, ge=2)
 

@@ -14,8 +14,8 @@ from georef.estimation.prior_check import STRONG_EVIDENCE, against_prior
 from georef.estimation.query import Query
 from georef.estimation.query_centred import query_centred
 from georef.estimation.reference_map import ReferenceMap
-from georef.estimation.search import FindSimilar, Search
-from georef.estimation.turning import Looked, TurnedPicture, promising_turns
+from georef.estimation.search import FindSimilar, Ranking, Search
+from georef.estimation.turning import Looked, TurnedPicture, has_few_votes, promising_turns
 from georef.features.base import Matcher
 from georef.types.campaign import Image
 from georef.types.features import Features
@@ -66,18 +66,35 @@ def localize_image(
 
 
 def _localize_either_way(query: Query, box: Box, picture: TurnedPicture | None) -> Outcome:
-    """The outcome that rests on most points, of the picture as it is and, where these are few, turned as votes say."""
-    best = _localize_in(query, box)
-    if picture is None or not _needs_more(best, query.config):
-        return best
+    """The outcome that rests on most points: of the picture as it is, or turned as votes say.
+
+    Votes are asked where the picture has few as it is, which is known before anything is matched, or few points.
+    """
+    ranking = _ranked(query, box)
+    if picture is None:
+        return _localize_with(query, ranking)
+    candidates = query.search.config
+    on_its_side = has_few_votes(ranking, min(len(query.features), candidates.vote_keypoints), candidates)
+    first = _localize_turned(query, box, picture) if on_its_side else None
+    if first is not None and not _needs_more(first, query.config):
+        return first
+    as_it_is = _localize_with(query, ranking)
+    if not on_its_side and _needs_more(as_it_is, query.config):
+        first = _localize_turned(query, box, picture)
+    return as_it_is if first is None or _points(as_it_is) >= _points(first) else first
+
+
+def _localize_turned(query: Query, box: Box, picture: TurnedPicture) -> Outcome | None:
+    """The best outcome of the ways up that have clearly more votes; None where there is none."""
     with query.timed("turning"):
         search, tried = query.search, query.features.quarter_turns
         turns = promising_turns(picture, query.reference, search.where, search.config, box, tried)
+    best = None
     for other in turns:
         with query.timed("turning"):
             turned = _seen_as(query, picture.look(other))
-        outcome = _localize_in(turned, box)
-        if _points(outcome) > _points(best):
+        outcome = _localize_with(turned, _ranked(turned, box))
+        if best is None or _points(outcome) > _points(best):
             best = outcome
         if not _needs_more(best, query.config):
             break
@@ -109,13 +126,15 @@ def _needs_more(outcome: Outcome, config: LocalizeConfig) -> bool:
     return _points(outcome) < STRONG_EVIDENCE * config.min_inliers
 
 
-def _localize_in(query: Query, box: Box) -> Outcome:
-    if box.note and box.note not in query.notes:
-        query.notes.append(box.note)
+def _ranked(query: Query, box: Box) -> Ranking:
     with query.timed("candidates"):
-        ranked, note = query.search.ranked(box)
-    if note and note not in query.notes:
-        query.notes.append(note)
+        ranking = query.search.ranked(box)
+    query.notes += [note for note in (box.note, ranking.note) if note and note not in query.notes]
+    return ranking
+
+
+def _localize_with(query: Query, ranking: Ranking) -> Outcome:
+    ranked = ranking.indices
     if len(ranked) < 2:
         return Rejected(query.image.image_id, RejectReason.NO_CANDIDATES, f"{len(ranked)} reference images")
     tried = tuple(query.reference.images[int(i)].image_id for i in ranked[: query.search.config.count])

@@ -26,6 +26,19 @@ class FindSimilar(Protocol):
 
 
 @dataclass(frozen=True, eq=False)
+class Ranking:
+    """References, the most promising first."""
+
+    indices: NDArray[np.int64]
+    note: str = ""  # where some were left out
+    votes: NDArray[np.int64] | None = None  # of each, where they were counted
+
+    def mean_votes(self, count: int) -> float:
+        """Of the `count` references that have most; 0 where there is none."""
+        return 0.0 if self.votes is None or not len(self.votes) else float(self.votes[:count].mean())
+
+
+@dataclass(frozen=True, eq=False)
 class Search:
     """What one query is searched with. Without `find_similar` the ranking must be "votes"."""
 
@@ -43,18 +56,18 @@ class Search:
         """Where it is looked for then."""
         return everywhere(self.reference.positions, self.where)
 
-    def ranked(self, box: Box) -> tuple[NDArray[np.int64], str]:
-        """References that may show what the query shows, the most promising first, and a note where some were left."""
+    def ranked(self, box: Box) -> Ranking:
+        """References that may show what the query shows, the most promising first."""
         config = self.config
         if config.ranking == "global":
-            return self._similar(config.count, box), ""
-        shortlist, note = self._shortlist(box)
-        return shortlist[np.argsort(-self._votes(shortlist), kind="stable")], note
+            return Ranking(self._similar(config.count, box))
+        return self.by_votes(box)
 
-    def best_votes(self, box: Box) -> int:
-        """Votes of the references that have most, as many as a first pose is tried with."""
-        votes = np.sort(self._votes(self._shortlist(box)[0]))
-        return int(votes[-self.config.first_count :].sum())
+    def by_votes(self, box: Box) -> Ranking:
+        """References by the number of features that they seem to have in common with the query."""
+        shortlist, note = self._shortlist(box)
+        votes = self._votes(shortlist)
+        return Ranking(shortlist[np.argsort(-votes, kind="stable")], note, np.sort(votes)[::-1])
 
     def with_neighbours(self, ranked: NDArray[np.int64], position: Array) -> NDArray[np.int64]:
         """The ranked references, then those nearest to a position (3,), which similarity may have missed."""

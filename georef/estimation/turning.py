@@ -12,10 +12,11 @@ from typing import Protocol
 from georef.config import CandidatesConfig
 from georef.estimation.candidates import Box, Whereabouts
 from georef.estimation.reference_map import ReferenceMap
-from georef.estimation.search import FindSimilar, Search
+from georef.estimation.search import FindSimilar, Ranking, Search
 from georef.types.features import Features
 
 _MORE_VOTES = 1.25  # than the other way up: four references have about 100 by chance, and 10 of them are noise
+_BY_CHANCE = 0.12  # of the features compared; 0.08 is the most of 50 references that show other things
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,6 +51,12 @@ def promising_turns(
     votes = {}
     for turns in range(4):
         looked = picture.glance(turns)
-        votes[turns] = Search(reference, looked.features, where, config, looked.find_similar).best_votes(box)
+        ranking = Search(reference, looked.features, where, config, looked.find_similar).by_votes(box)
+        votes[turns] = ranking.mean_votes(config.first_count)
     better = [turns for turns in votes if turns != tried and votes[turns] > _MORE_VOTES * votes[tried]]
     return sorted(better, key=lambda turns: -votes[turns])
+
+
+def has_few_votes(ranking: Ranking, compared: int, config: CandidatesConfig) -> bool:
+    """Whether the references that have most votes, of so many features, hardly have more than any pictures have."""
+    return ranking.votes is not None and ranking.mean_votes(config.first_count) < _BY_CHANCE * compared
