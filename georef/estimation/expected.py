@@ -3,9 +3,10 @@
 Each reference is expected to see some of the points that a first pose rests on. Points are fixed by the rays to them
 (N = sum p J'J / s^2), the pose by its points (H = sum A' (s^2 I + B N^-1 B')^-1 A), and the errors of the reference
 poses come through both, as in the covariance of a localized pose. The choice is greedy: the reference that makes the
-determinant of the covariance smallest goes first, and none that would make it larger: weights go by image noise, so that
-a reference whose own errors come through strongly does harm. The choice asks for rays that intersect at good angles, for points all over
-the image, and for references whose errors are independent, where a count of common points asks for more of the same.
+determinant of the covariance smallest goes first. None is taken that would make it larger: points are weighted by image
+noise alone, so that a reference whose own error comes through strongly does harm. This asks for rays that intersect at
+good angles, for points all over the image, and for references whose errors are independent, where a count of common
+points asks for more of the same.
 """
 
 from __future__ import annotations
