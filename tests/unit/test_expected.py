@@ -66,8 +66,8 @@ def model(query: Seen) -> LocalModel:
 
 
 def test_rays_from_elsewhere_come_before_more_of_the_same(query: Seen, model: LocalModel) -> None:
-    """Five references a few centimetres apart see most of what the query sees; two at three metres see less."""
-    crowd = [_beside(query.truth, [0.02 * i, 0.0, 0.0]) for i in range(5)]
+    """Five references a few centimetres apart see most of what the query sees; two farther away see less."""
+    crowd = [_beside(query.truth, [0.8 + 0.02 * i, -0.8, 0.0]) for i in range(5)]
     apart = [_beside(query.truth, [-3.0, -0.5, 0.2], 12.0), _beside(query.truth, [3.0, -0.5, 0.0], -12.0)]
     choice = _choose(query, model, [*crowd, *apart], 3)
     assert {5, 6} & set(choice.order[:2].tolist())
