@@ -100,7 +100,7 @@ class LocalizeTask:
         """None for an image that cannot lie on its side, and where turned ones are not to be tried."""
         if not self.config.localize.try_turned or image.image_id in self.upright:
             return None
-        return TurnableImage(image, self.store_folder, self.config.features, self.extractor, self.similar)
+        return TurnableImage(image, self.store_folder, self.config.features, lambda: self.extractor, self.similar)
 
     @cached_property
     def extractor(self) -> Extractor:

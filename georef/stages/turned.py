@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -31,7 +32,7 @@ class TurnableImage:
     image: Image
     store_folder: Path
     config: FeaturesConfig
-    extractor: Extractor
+    extractor: Callable[[], Extractor]  # loaded when it is first needed, which is seldom
     similar: SimilarImages | None
 
     @property
@@ -57,7 +58,7 @@ class TurnableImage:
 
     def _extract(self, quarter_turns: int, level: int | None, budget: int | None) -> Features:
         pixels = turned(self._pixels, quarter_turns)
-        return extract_features(self.extractor, pixels, level, budget).turned_back(quarter_turns)
+        return extract_features(self.extractor(), pixels, level, budget).turned_back(quarter_turns)
 
     def _looked(self, features: Features) -> Looked:
         return Looked(features, None if self.similar is None else self.similar.to_image(self.image, features))

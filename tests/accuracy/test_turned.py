@@ -55,7 +55,7 @@ def test_a_photograph_on_its_side_has_the_pose_of_the_upright_one(
     )
 
     def localized(image: Image) -> Localized:
-        picture = TurnableImage(image, tmp_path / "store", _CONFIG, extractor, None)
+        picture = TurnableImage(image, tmp_path / "store", _CONFIG, lambda: extractor, None)
         outcome: Outcome = localize_image(
             image,
             _extract(extractor, image.path),
