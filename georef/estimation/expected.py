@@ -3,10 +3,10 @@
 Each reference is expected to see some of the points that a first pose rests on. Points are fixed by the rays to them
 (N = sum p J'J / s^2), the pose by its points (H = sum A' (s^2 I + B N^-1 B')^-1 A), and the errors of the reference
 poses come through both, as in the covariance of a localized pose. The choice is greedy: the reference that makes the
-determinant of the covariance smallest goes first. None is taken that would make it larger: points are weighted by image
-noise alone, so that a reference whose own error comes through strongly does harm. This asks for rays that intersect at
-good angles, for points all over the image, and for references whose errors are independent, where a count of common
-points asks for more of the same.
+determinant of the covariance smallest goes first, until the next one would make it hardly smaller. It may even make it
+larger: points are weighted by image noise alone, so that a reference whose error comes through does harm. This asks for
+rays that intersect at good angles, for points all over the image, and for references whose errors are independent,
+where a count of common points asks for more of the same.
 """
 
 from __future__ import annotations
@@ -27,6 +27,7 @@ _POINTS = 120  # of the model that the expectation is computed with
 _CANDIDATES = 40  # that see most
 _MATCHING_ANGLE_RAD = np.radians(25.0)  # at which a third of what two images see in common is still matched
 _LARGEST_ANGLE_RAD = np.radians(60.0)
+_LEAST_GAIN = -12.0 * np.log(1.0 - 0.03)  # of the logarithm of the determinant: sigmas 3 % smaller, one with another
 _DEPTH_UNKNOWN = 0.5  # 1-sigma of a point before any ray, over its distance
 _POSE_UNKNOWN = np.diag([1.0, 1.0, 1.0, 1e-2, 1e-2, 1e-2])  # information of a pose before any point: 1 rad, 10 m
 
@@ -83,11 +84,13 @@ def most_informative(
     sizes: Array,
     pose_covs: Sequence[Array],
     noise: ReferenceNoise,
+    least: int,
     count: int,
 ) -> Choice:
     """At most `count` of the references (views; sizes (V, 2) width and height; pose_covs (6, 6) each), the best first.
 
-    model: points that the query sees from `pose`. References that see none of them from a similar side are left out.
+    model: points that the query sees from `pose`. References that see none of them from a similar side are left out,
+    and those that would hardly improve the pose once there are `least`.
     """
     points = np.unique(np.linspace(0, len(model) - 1, min(_POINTS, len(model))).round().astype(int))
     keypoint, points, total = model.keypoint[points], model.points[points], len(model)
@@ -114,7 +117,7 @@ def most_informative(
         np.array([pose_covs[int(i)] for i in useful]),
         total / len(points),
     )
-    order, sigma_m = _greedy(expectation, count)
+    order, sigma_m = _greedy(expectation, least, count)
     return Choice(useful[order], sigma_m)
 
 
@@ -123,7 +126,7 @@ def largest_position_sigma(cov: Array) -> float:
     return float(np.sqrt(np.linalg.eigvalsh(cov[3:, 3:])[-1]))
 
 
-def _greedy(expectation: _Expectation, count: int) -> tuple[NDArray[np.int64], Array]:
+def _greedy(expectation: _Expectation, least: int, count: int) -> tuple[NDArray[np.int64], Array]:
     chosen: list[int] = []
     sigmas: list[float] = []
     left, smallest = np.arange(len(expectation.seen)), np.inf
@@ -131,7 +134,7 @@ def _greedy(expectation: _Expectation, count: int) -> tuple[NDArray[np.int64], A
         covs = expectation.covariances(chosen, left)
         volumes = np.linalg.slogdet(covs)[1]
         best = int(volumes.argmin())
-        if volumes[best] >= smallest and len(chosen) >= 2:
+        if volumes[best] > smallest - _LEAST_GAIN and len(chosen) >= least:
             break
         smallest = volumes[best]
         sigmas.append(largest_position_sigma(covs[best]))

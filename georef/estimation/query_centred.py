@@ -154,6 +154,7 @@ def _in_order(query: Query, ranked: NDArray[np.int64], pose: Rigid3, model: Loca
             sizes,
             [query.reference.pose_cov(i) for i in asked],
             query.reference.noise,
+            query.search.config.first_count,
             query.search.config.count,
         )
         return _Order([asked[int(i)] for i in choice.order], choice.sigma_m)

@@ -36,6 +36,7 @@ def _choose(query: Seen, model: LocalModel, poses: list[Rigid3], count: int, noi
         np.tile(_SIZE, (len(poses), 1)),
         [noise.pose_cov(pose) for pose in poses],
         noise,
+        2,
         count,
     )
 
@@ -87,7 +88,7 @@ def test_a_reference_that_is_known_better_goes_first(query: Seen, model: LocalMo
     views, sizes = Views.of(poses, [CAMERA] * 4), np.tile(_SIZE, (4, 1))
     weak, good = scaled_noise(NOISE, poses=10.0), NOISE
     covs: list[Array] = [noise.pose_cov(pose) for noise, pose in zip([weak, weak, good, good], poses, strict=True)]
-    choice = most_informative(query.truth, _observed(query), model, views, sizes, covs, NOISE, 4)
+    choice = most_informative(query.truth, _observed(query), model, views, sizes, covs, NOISE, 2, 4)
     assert sorted(choice.order[:2]) == [2, 3]
 
 
