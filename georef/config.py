@@ -66,6 +66,7 @@ class CandidatesConfig(Section):
     shortlist: int = Field(default=50, ge=2)
     count: int = Field(default=10, ge=2)
     first_count: int = Field(default=4, ge=2)
+    target_sigma_m: float = Field(default=0.0, ge=0)
     vote_keypoints: int = Field(default=512, ge=16)
     max_searched: int = Field(default=2000, ge=2)
 
@@ -80,6 +81,7 @@ class LocalizeConfig(Section):
     min_inlier_ratio: float = Field(default=0.1, ge=0, le=1)
     max_position_sigma_m: float = Field(default=1.0, gt=0)
     max_correspondences: int = Field(default=0, ge=0)
+    try_turned: bool = True
     seed: int = 0
 
 

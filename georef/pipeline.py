@@ -102,8 +102,8 @@ STAGES: tuple[Stage, ...] = (
     Stage(
         "global-map", 1, _MAP_KEYS, _reference_with_images, ("network",), global_map.run, _uses_map, of_reference=True
     ),
-    Stage("localize", 4, _LOCALIZE_KEYS, _epoch_files, ("features", "network", "index", "global-map"), localize.run),
-    Stage("adjust", 4, ("adjust", "localize", "matching"), _control, ("features", "network", "localize"), adjust.run),
+    Stage("localize", 5, _LOCALIZE_KEYS, _epoch_files, ("features", "network", "index", "global-map"), localize.run),
+    Stage("adjust", 5, ("adjust", "localize", "matching"), _control, ("features", "network", "localize"), adjust.run),
     Stage("report", 2, ("report",), _check, ("features", "network", "localize", "adjust"), report.run),
 )
 

@@ -13,7 +13,7 @@ from georef.types.campaign import Image
 from georef.types.results import Outcome, Rejected, RejectReason
 
 _PRIOR_PROBABILITY = 0.9999
-_STRONG_EVIDENCE = 3  # times min_inliers: then the images overrule a position prior
+STRONG_EVIDENCE = 3  # times min_inliers: then the images overrule a position prior
 
 
 def against_prior(outcome: Outcome, image: Image, config: LocalizeConfig) -> Outcome:
@@ -25,7 +25,7 @@ def against_prior(outcome: Outcome, image: Image, config: LocalizeConfig) -> Out
     if off @ np.linalg.solve(cov, off) <= chi2.ppf(_PRIOR_PROBABILITY, 3):
         return outcome
     distance = float(np.linalg.norm(off))
-    if outcome.correspondence_count < _STRONG_EVIDENCE * config.min_inliers:
+    if outcome.correspondence_count < STRONG_EVIDENCE * config.min_inliers:
         detail = f"{outcome.correspondence_count} points put it {distance:.1f} m from its position prior"
         return Rejected(image.image_id, RejectReason.PRIOR_CONTRADICTS, detail)
     return replace(outcome, gnss_rejected=True, gnss_offset_m=distance)

@@ -40,7 +40,6 @@ class Query:
     cpu_s: dict[str, float] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
     pairs: dict[int, Matches] = field(default_factory=dict)
-    tried: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         self.use(self.image.camera)
@@ -109,6 +108,7 @@ def outcome_of(query: Query, estimate: EstimatedPose | None, model: LocalModel, 
         cpu_s=dict(query.cpu_s),
         camera=estimate.camera if query.image.camera.estimate else None,
         intrinsics_cov=estimate.intrinsics_cov if query.image.camera.estimate else None,
+        quarter_turns=query.features.quarter_turns,
     )
 
 

@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from georef.estimation.candidates import overlap
+from georef.estimation.agreement import Contradiction, Matched, contradiction
+from georef.estimation.expected import largest_position_sigma, most_informative
 from georef.estimation.guided import GuidedOptions, guided_matches
 from georef.estimation.local_model import LocalModel, query_centred_model
 from georef.estimation.pnp import EstimatedPose, refine_pose
 from georef.estimation.query import Query, consensus, matched, outcome_of
-from georef.geometry.rigid import Rigid3
+from georef.geometry.rigid import Array, Rigid3
 from georef.types.features import Matches
 from georef.types.results import Outcome, Rejected, RejectReason
+
+_MOST_LEFT_OUT = 3  # contradictions of one query; with more, it is not the references that are odd
 
 
 def query_centred(query: Query, ranked: NDArray[np.int64]) -> Outcome:
@@ -27,21 +30,89 @@ def query_centred(query: Query, ranked: NDArray[np.int64]) -> Outcome:
     if first is None or isinstance(first, Rejected):
         return first or Rejected(query.image.image_id, RejectReason.NO_CANDIDATES, "no reference image")
     pose, model = first
-    chosen = _that_see(query, ranked, pose, model)
-    estimate, model = _guided_pose(query, pose, chosen)
-    if query.image.camera.estimate and estimate is not None:  # its lines were those of a camera from few matches
-        query.use(estimate.camera)
-        estimate, model = _guided_pose(query, estimate.world_from_cam, chosen)
-    return outcome_of(query, estimate, model, chosen)
+    order = _in_order(query, ranked, pose, model)
+    found = _guided_poses(query, pose, order)
+    if query.image.camera.estimate and found.estimate is not None:  # its lines were those of a camera from few matches
+        query.use(found.estimate.camera)
+        found = _guided_poses(query, found.estimate.world_from_cam, order)
+    found = _agreeing(query, found)
+    return outcome_of(query, found.estimate, found.model, found.chosen)
 
 
-def _guided_pose(query: Query, pose: Rigid3, chosen: Sequence[int]) -> tuple[EstimatedPose | None, LocalModel]:
-    with query.timed("guided matching"):
-        matches = [_guided(query, pose, index) for index in chosen]
+@dataclass(frozen=True, eq=False)
+class _Guided:
+    """A pose from the guided matches with some references."""
+
+    chosen: list[int]
+    matches: list[Matches]
+    estimate: EstimatedPose | None
+    model: LocalModel
+
+
+@dataclass(frozen=True, eq=False)
+class _Order:
+    """References, the most helpful first, and the position sigma (m) that is expected with each and those before."""
+
+    indices: list[int]
+    sigma_m: Array
+
+    def needed(self, sigma_m: float, factor: float = 1.0) -> int:
+        """How many of them are expected to reach a sigma; all where none does."""
+        enough = np.flatnonzero(factor * self.sigma_m <= sigma_m)
+        return int(enough[0]) + 1 if len(enough) else len(self.indices)
+
+
+def _guided_poses(query: Query, pose: Rigid3, order: _Order) -> _Guided:
+    """Guided matching in as many references as it takes until the position is known well enough, or in all."""
+    target, least = query.search.config.target_sigma_m, query.search.config.first_count
+    count = max(least, order.needed(target))
+    matches: list[Matches] = []
+    while True:
+        chosen = order.indices[:count]
+        with query.timed("guided matching"):
+            matches += [_guided(query, pose, index) for index in chosen[len(matches) :]]
+        found = _pose_of(query, pose, chosen, matches)
+        sigma = np.inf if found.estimate is None else largest_position_sigma(found.estimate.cov)
+        if sigma <= target or count >= len(order.indices):
+            return found
+        factor = sigma / order.sigma_m[len(chosen) - 1]
+        count = max(count + 1, order.needed(target, factor))
+
+
+def _pose_of(query: Query, pose: Rigid3, chosen: list[int], matches: list[Matches]) -> _Guided:
     with query.timed("pose"):
         references = [query.reference.posed(i) for i in chosen]
         model = query_centred_model(references, matches, query.reference.noise.keypoint_sigma)
-        return refine_pose(pose, query.observed, model, query.reference.errors(chosen)), model
+        estimate = refine_pose(pose, query.observed, model, query.reference.errors(chosen))
+        return _Guided(chosen, matches, estimate, model)
+
+
+def _agreeing(query: Query, found: _Guided) -> _Guided:
+    """The pose without the references and epochs that contradict the others."""
+    for _ in range(_MOST_LEFT_OUT):
+        if found.estimate is None:
+            return found
+        with query.timed("agreement"):
+            odd = _contradiction(query, found, found.estimate)
+        if odd is None:
+            return found
+        query.notes.append(odd.describe(query.reference.images[found.chosen[odd.views[0]]].image_id))
+        kept = [v for v in range(len(found.chosen)) if v not in odd.views]
+        chosen, matches = [found.chosen[v] for v in kept], [found.matches[v] for v in kept]
+        found = _pose_of(query, found.estimate.world_from_cam, chosen, matches)
+    return found
+
+
+def _contradiction(query: Query, found: _Guided, estimate: EstimatedPose) -> Contradiction | None:
+    matched = Matched(
+        [query.reference.posed(i) for i in found.chosen],
+        found.matches,
+        query.reference.errors(found.chosen),
+        [query.reference.images[i].epoch for i in found.chosen],
+        query.reference.noise.keypoint_sigma,
+    )
+    observed = query.observed.with_camera(estimate.camera)
+    return contradiction(matched, observed, estimate.world_from_cam, found.model.take(estimate.inliers))
 
 
 def _first_pose(query: Query, indices: list[int]) -> tuple[Rigid3, LocalModel] | Rejected:
@@ -67,17 +138,24 @@ def _first_pose(query: Query, indices: list[int]) -> tuple[Rigid3, LocalModel] |
         return refined.world_from_cam, model
 
 
-def _that_see(query: Query, ranked: NDArray[np.int64], pose: Rigid3, model: LocalModel) -> list[int]:
-    """The references that see most of the points from a similar side, at most `count`, already matched ones first."""
+def _in_order(query: Query, ranked: NDArray[np.int64], pose: Rigid3, model: LocalModel) -> _Order:
+    """The references that fix the pose best together, `count` at most."""
     with query.timed("candidates"):
-        directions = model.points - pose.translation
-        directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-        asked = query.search.with_neighbours(ranked, pose.translation)
-        cameras = [query.reference.images[int(i)].camera for i in asked]
+        asked = [int(i) for i in query.search.with_neighbours(ranked, pose.translation)]
+        cameras = [query.reference.images[i].camera for i in asked]
         sizes = np.array([[c.width, c.height] for c in cameras], dtype=float)
-        seen = overlap(model.points, directions, query.reference.views([int(i) for i in asked]), sizes)
-        order = np.argsort(-seen, kind="stable")
-        return [int(asked[i]) for i in order[: query.search.config.count] if seen[i] > 0]
+        choice = most_informative(
+            pose,
+            query.observed,
+            model,
+            query.reference.views(asked),
+            sizes,
+            [query.reference.pose_cov(i) for i in asked],
+            query.reference.noise,
+            query.search.config.first_count,
+            query.search.config.count,
+        )
+        return _Order([asked[int(i)] for i in choice.order], choice.sigma_m)
 
 
 def _guided(query: Query, pose: Rigid3, index: int) -> Matches:

@@ -56,6 +56,15 @@ class ReferenceErrors:
         chosen = np.array([covs[i] for i in leaders], dtype=np.float64).reshape(-1, 6, 6)
         return cls(index.astype(np.int64), np.array(by_station).reshape(-1, 6, 6), chosen)
 
+    def take(self, views: Sequence[int]) -> Self:
+        """Those of some views, in the order named."""
+        return type(self)(self.station[list(views)], self.by_station[list(views)], self.covs)
+
+    def cov(self, view: int) -> Array:
+        """Covariance (6, 6) of the error of one view."""
+        by_station = self.by_station[view]
+        return symmetric(by_station @ self.covs[self.station[view]] @ by_station.T)
+
     def propagated(self, gains: Array) -> Array:
         """Covariance (K, K) that the errors bring to K unknowns, which follow them by gains (R, K, 6)."""
         by_station = segment_sum(gains @ self.by_station, self.station, len(self.covs))  # (S, K, 6)

@@ -52,6 +52,11 @@ def read_image(path: Path) -> NDArray[np.uint8]:
     return pixels
 
 
+def turned(pixels: NDArray[np.uint8], quarter_turns: int) -> NDArray[np.uint8]:
+    """The image (H, W, 3) turned clockwise."""
+    return np.ascontiguousarray(np.rot90(pixels, -quarter_turns))
+
+
 def _rgb(image: Image.Image) -> NDArray[np.uint8]:
     if image.mode.startswith("I;16"):
         grey = (np.asarray(image).astype(np.uint16) >> 8).astype(np.uint8)

@@ -78,9 +78,11 @@ class LightGlue:
         return torch.from_numpy(inputs[0]).to(self._device), torch.from_numpy(inputs[1]).to(self._device)
 
     def _places(self, features: Features) -> NDArray[np.float32]:
-        """Keypoints (N, 2) from the image's centre in units of half its longest side."""
-        size = np.array(features.image_size, np.float32)
-        return (features.keypoints_px - size / 2) / (size.max() / 2)
+        """Keypoints (N, 2) from the centre in units of half the longest side of the picture, as it was turned when they
+        were found."""
+        keypoints_px, image_size = features.as_found
+        size = np.array(image_size, np.float32)
+        return (keypoints_px - size / 2) / (size.max() / 2)
 
     def _rows(self, features: Features) -> NDArray[np.float32]:
         """Descriptors (N, D) as the weights were trained with them."""
@@ -159,9 +161,10 @@ def _best_precision(device: torch.device) -> Precision:
 
 
 def _orientations(features: Features) -> NDArray[np.float32]:
-    if features.orientations_rad is None:
+    orientations = features.orientations_as_found
+    if orientations is None:
         raise ValueError("expected features with orientations, as SIFT has them")
-    return features.orientations_rad
+    return orientations
 
 
 def _mutual_matches(log_scores: Tensor, min_score: float) -> Matches:

@@ -1,9 +1,9 @@
-"""Pixel coordinates under resizing. The centre of the top-left pixel is (0.5, 0.5) at every size."""
+"""Pixel coordinates under resizing and turning. The centre of the top-left pixel is (0.5, 0.5) at every size."""
 
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from georef.geometry.rigid import Array
 
@@ -19,3 +19,21 @@ def level_size(image_size: tuple[int, int], longest_side: int) -> tuple[int, int
     factor = min(1.0, longest_side / max(image_size))
     width, height = (max(1, round(side * factor)) for side in image_size)
     return width, height
+
+
+def turn_keypoints(keypoints_px: ArrayLike, *, size: tuple[int, int], quarter_turns: int) -> Array:
+    """Keypoints (N, 2) of a picture of `size` (width, height) in the same picture turned clockwise by quarter turns."""
+    x, y = np.asarray(keypoints_px, dtype=np.float64).T
+    width, height = size
+    turned = ((x, y), (height - y, x), (width - x, height - y), (y, width - x))
+    return np.column_stack(turned[quarter_turns % 4])
+
+
+def turn_angles(angles_rad: NDArray[np.float32], quarter_turns: int) -> NDArray[np.float32]:
+    """Directions (N,) from x towards y of a picture, in (-pi, pi], in the same picture turned clockwise."""
+    return (np.pi - (np.pi - angles_rad - 0.5 * np.pi * quarter_turns) % (2.0 * np.pi)).astype(np.float32)
+
+
+def turned_size(size: tuple[int, int], quarter_turns: int) -> tuple[int, int]:
+    """Width and height of a picture of `size` after quarter turns."""
+    return (size[1], size[0]) if quarter_turns % 2 else size

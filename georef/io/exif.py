@@ -1,4 +1,4 @@
-"""What an image file says of itself: its size, and the focal length that its camera noted in EXIF."""
+"""What an image file says of itself: its size, the focal length, and which way up the camera was held, by EXIF."""
 
 from __future__ import annotations
 
@@ -13,6 +13,8 @@ log = logging.getLogger(__name__)
 
 _EXIF_SECTION, _FOCAL_35MM, _FOCAL_MM = 0x8769, 0xA405, 0x920A
 _PLANE_X_RESOLUTION, _PLANE_UNIT, _PIXEL_WIDTH = 0xA20E, 0xA210, 0xA002
+_ORIENTATION = 0x0112
+_TURNS = {6: 1, 3: 2, 8: 3}  # quarter turns clockwise by the tag
 _DIAGONAL_35MM = float(np.hypot(36.0, 24.0))  # CIPA DCG-001: the equivalent focal length goes by the diagonal
 _UNIT_MM = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
 _SHORTEST, _LONGEST = 0.2, 30.0  # of the longer side; beyond, the tags are wrong
@@ -40,6 +42,16 @@ def size_and_focal(path: Path) -> tuple[tuple[int, int], float | None]:
         log.warning("%s: EXIF states a focal length of %.0f px, which cannot be", path, focal)
         focal = None
     return size, focal
+
+
+def stated_quarter_turns(path: Path) -> int:
+    """Quarter turns clockwise that EXIF says make the picture upright: 0 where it says nothing, or a mirror image.
+
+    Raises OSError for a file that is missing, no image, or too large.
+    """
+    with open_picture(path) as image:
+        orientation = image.getexif().get(_ORIENTATION)
+    return _TURNS.get(orientation, 0) if isinstance(orientation, int) else 0
 
 
 def _focal_px(tags: dict[int, object], size: tuple[int, int]) -> float | None:

@@ -67,6 +67,7 @@ def write_outcome(path: Path, outcome: Outcome) -> None:
         "references": [m.reference_id for m in outcome.matches],
         "gnss_rejected": outcome.gnss_rejected,
         "gnss_offset_m": outcome.gnss_offset_m,
+        "quarter_turns": outcome.quarter_turns,
         **_told(outcome),
         "camera": None if outcome.camera is None else asdict(outcome.camera),
     }
@@ -105,6 +106,7 @@ def read_outcome(path: Path) -> Outcome:
         keypoints=arrays["keypoints"],
         gnss_rejected=header["gnss_rejected"],
         gnss_offset_m=header["gnss_offset_m"],
+        quarter_turns=header["quarter_turns"],
         **told,
         camera=_camera(header.get("camera")),
         intrinsics_cov=arrays.get("intrinsics_cov"),

@@ -59,7 +59,7 @@ def run(context: StageContext) -> StageSummary:
     store = open_features(context.before["store"])
     images = [epoch[o.image_id] for o in localized]
     posed = [
-        PosedFeatures.of(store.read(feature_id(image)), image.camera, o.world_from_cam)
+        PosedFeatures.of(store.read(feature_id(image, o.quarter_turns)), image.camera, o.world_from_cam)
         for image, o in zip(images, localized, strict=True)
     ]
     task = make_task(context)

@@ -44,9 +44,10 @@ class StageSummary:
 Run = Callable[[StageContext], StageSummary]
 
 
-def feature_id(image: Image) -> str:
-    """The key of an image in the feature store, which holds all epochs."""
-    return f"{image.epoch}/{image.image_id}"
+def feature_id(image: Image, quarter_turns: int = 0) -> str:
+    """The key of an image in the feature store, which holds all epochs; or of its picture turned clockwise."""
+    turned = f"?quarter_turns={quarter_turns}" if quarter_turns else ""
+    return f"{image.epoch}/{image.image_id}{turned}"
 
 
 def open_features(folder: Path) -> FeatureStore:

@@ -29,7 +29,7 @@ class ExtractTask:
 
     @cached_property
     def extractor(self) -> Extractor:
-        return _load_extractor(self.config)
+        return load_extractor(self.config)
 
     def __call__(self, image: Image) -> tuple[str, str] | None:
         extractor = self.extractor  # what keeps it from being loaded is no fault of the image
@@ -46,9 +46,8 @@ class ExtractTask:
         if size != (camera.width, camera.height):
             problem = f"the image has {size[0]} x {size[1]} px, its camera {camera.width} x {camera.height}"
             return RejectReason.WRONG_SIZE.value, problem
-        level, budget = self.config.longest_side_px or None, self.config.max_keypoints or None
-        features = extract_features(extractor, pixels, level, budget)
-        _store(self.folder, self.version, self.config).write(feature_id(image), features, image.path)
+        features = extract_features(extractor, pixels, *level_and_budget(self.config))
+        feature_store(self.folder, self.version, self.config).write(feature_id(image), features, image.path)
         return None
 
 
@@ -58,7 +57,7 @@ def run(context: StageContext) -> StageSummary:
     uncut = cut_missing(context.survey.cutouts, context.executor)
     version = extractor_version(context.config.features)
     folder = context.before["store"]
-    store = _store(folder, version, context.config.features)
+    store = feature_store(folder, version, context.config.features)
     pending = [image for image in images if not store.has(feature_id(image), image.path)]
     task = ExtractTask(folder, version, context.config.features)
     failed = {
@@ -72,7 +71,13 @@ def run(context: StageContext) -> StageSummary:
     return StageSummary(line + unreadable, {"failed": failed}, len(pending) - len(failed), len(images))
 
 
-def _store(folder: Path, version: str, config: FeaturesConfig) -> FeatureStore:
+def level_and_budget(config: FeaturesConfig) -> tuple[int | None, int | None]:
+    """Longest side and number of keypoints; None for the full resolution, and for the budget of the level."""
+    return config.longest_side_px or None, config.max_keypoints or None
+
+
+def feature_store(folder: Path, version: str, config: FeaturesConfig) -> FeatureStore:
+    """The store for features of a version, as the configuration keeps them."""
     return FeatureStore(folder, extractor_version=version, quantize=config.quantize)
 
 
@@ -82,10 +87,11 @@ def extractor_version(config: FeaturesConfig) -> str:
     level = f"longest side {config.longest_side_px or 'full'}"
     budget = f"at most {config.max_keypoints or 'the budget of the level'}"
     stored = "quantized" if config.quantize else "exact"
-    return f"{_load_extractor(config).version()}; extraction {EXTRACTION_VERSION}; {level}; {budget}; {stored}"
+    return f"{load_extractor(config).version()}; extraction {EXTRACTION_VERSION}; {level}; {budget}; {stored}"
 
 
-def _load_extractor(config: FeaturesConfig) -> Extractor:
+def load_extractor(config: FeaturesConfig) -> Extractor:
+    """The configured extractor."""
     return load_component(EXTRACTORS, config.extractor, device=config.device)
 
 

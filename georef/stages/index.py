@@ -19,7 +19,7 @@ from georef.estimation.candidates import Box
 from georef.estimation.search import FindSimilar
 from georef.features.globals.base import GlobalDescriptor, Needs, Row
 from georef.features.globals.state import LearnedState
-from georef.features.images import UnreadableImage, read_image
+from georef.features.images import UnreadableImage, read_image, turned
 from georef.features.registry import GLOBAL_DESCRIPTORS, load_component
 from georef.geometry.angles import heading_of
 from georef.stages.base import StageContext, StageSummary, feature_id, open_features
@@ -126,7 +126,7 @@ class SimilarImages:
     row_of: Mapping[str, int]  # index into the reference map, by key in the database
 
     def to_image(self, image: Image, features: Features) -> FindSimilar:
-        """The search for one image, which is described when it is first searched for."""
+        """The search for one image, which is described when it is first searched for, turned as its features were."""
         return _Search(self, image, features)
 
 
@@ -141,7 +141,9 @@ class _Search:
     @cached_property
     def row(self) -> Row:
         task = self.similar.task
-        return task.describe(read_image(self.image.path) if task.descriptor.needs == "pixels" else self.features)
+        if task.descriptor.needs != "pixels":
+            return task.describe(self.features)
+        return task.describe(turned(read_image(self.image.path), self.features.quarter_turns))
 
     def __call__(self, count: int, box: Box, config: CandidatesConfig) -> NDArray[np.int64]:
         """Asks for more where what comes is not in the map: references that were set aside since."""

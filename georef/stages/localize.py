@@ -13,16 +13,17 @@ from georef.config import Config
 from georef.errors import ConfigError, StageError
 from georef.estimation.localization import localize_image
 from georef.estimation.reference_map import ReferenceMap
-from georef.features.base import Matcher
+from georef.features.base import Extractor, Matcher
 from georef.features.images import UnreadableImage
 from georef.features.registry import MATCHERS, load_component
 from georef.io.items import item_ids, item_path, read_outcome, write_outcome
 from georef.io.structures import read_structure
 from georef.stages.base import StageContext, StageSummary, feature_id, open_features
 from georef.stages.failures import internal_failure
-from georef.stages.features import failed_images
+from georef.stages.features import failed_images, load_extractor
 from georef.stages.index import SimilarImages, open_index
 from georef.stages.network import read_noise
+from georef.stages.turned import TurnableImage
 from georef.types.campaign import Campaign, Image
 from georef.types.features import Features
 from georef.types.results import Localized, Outcome, ReferenceNoise, Rejected, RejectReason
@@ -42,6 +43,7 @@ class LocalizeTask:
     failed: dict[str, tuple[str, str]]
     index_folder: Path | None  # of the vector database, where the ranking needs one
     map_folder: Path | None  # of the precomputed map, where the method needs one
+    upright: frozenset[str] = frozenset()  # new images that are known to stand upright
 
     @cached_property
     def similar(self) -> SimilarImages | None:
@@ -90,12 +92,23 @@ class LocalizeTask:
                 self.config.localize,
                 self.config.matching.max_keypoints,
                 similar,
+                self._picture(image),
             )
         except UnreadableImage as error:
             return Rejected(image.image_id, RejectReason.UNREADABLE, error.problem)
         except Exception as error:
             reason, detail = internal_failure(error, f"localization of {image.image_id}")
             return Rejected(image.image_id, RejectReason(reason), detail)
+
+    def _picture(self, image: Image) -> TurnableImage | None:
+        """None for an image that cannot lie on its side, and where turned ones are not to be tried."""
+        if not self.config.localize.try_turned or image.image_id in self.upright:
+            return None
+        return TurnableImage(image, self.store_folder, self.config.features, lambda: self.extractor, self.similar)
+
+    @cached_property
+    def extractor(self) -> Extractor:
+        return load_extractor(self.config.features)
 
 
 def run(context: StageContext) -> StageSummary:
@@ -120,7 +133,9 @@ def make_task(context: StageContext) -> LocalizeTask:
     campaign, folders = Campaign(context.survey.reference.epoch, usable), context.before
     noise, failed = read_noise(folders["network"])[0], failed_images(folders["features"])
     index, precomputed = folders.get("index"), folders.get("global-map")
-    return LocalizeTask(campaign, noise, folders["store"], context.config, failed, index, precomputed)
+    cut = {cutout.path for cutout in context.survey.cutouts}  # of panoramas, which stand upright
+    upright = frozenset(image.image_id for image in context.survey.epoch.images if image.path in cut)
+    return LocalizeTask(campaign, noise, folders["store"], context.config, failed, index, precomputed, upright)
 
 
 def usable_references(context: StageContext) -> list[Image]:

@@ -54,6 +54,7 @@ def encode(features: Features, quantize: bool) -> tuple[Arrays, dict[str, str]]:
         "encoding": QUANTIZED if quantize else EXACT,
         "descriptor_size": str(descriptors.shape[1]),
         "descriptor_dtype": descriptors.dtype.name,
+        "quarter_turns": str(features.quarter_turns),
     }
     return arrays, header
 
@@ -72,6 +73,7 @@ def decode(
         descriptors=_read_descriptors(arrays, header),
         colors_rgb=arrays["colors_rgb"],
         orientations_rad=arrays.get("orientations_rad"),
+        quarter_turns=int(header.get("quarter_turns", "0")),  # files written before it was said were not turned
     )
 
 

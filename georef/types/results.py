@@ -58,6 +58,7 @@ class Localized:
     camera: Camera | None = None  # as estimated, where the image's own is not known
     intrinsics_cov: Array | None = None  # (q, q) of steps of camera.estimate, see ESTIMABLE
     candidates: tuple[str, ...] = ()  # references that were tried, the most promising first
+    quarter_turns: int = 0  # clockwise, of the picture whose features `keypoints` and `matches` index
 
     @property
     def intrinsic_sigmas(self) -> dict[str, tuple[float, float]]:

@@ -126,3 +126,17 @@ def test_twice_the_same(matcher: Matcher, features_of: Of) -> None:
 def test_the_version_says_what_decides_the_result(matcher: Matcher) -> None:
     assert matcher.version() == matcher.version()
     assert matcher.version().startswith(matcher.name)
+
+
+@pytest.mark.parametrize("quarter_turns", [1, 2, 3])
+def test_features_of_a_turned_picture_match_as_they_were_found(
+    matcher: Matcher, features_of: Of, quarter_turns: int
+) -> None:
+    """Whatever looks at places sees them in the picture as it was turned."""
+    found = features_of(30)
+    other = found.take(np.random.default_rng(2).permutation(30))
+    expected = matcher.match(found, other)
+    matches = matcher.match(found.turned_back(quarter_turns), other)
+    np.testing.assert_array_equal(matches.indices, expected.indices)
+    np.testing.assert_allclose(matches.scores, expected.scores, atol=2e-3)
+    assert len(matches) > 0 or getattr(matcher, "weights", None) in MADE

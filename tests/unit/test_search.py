@@ -46,17 +46,17 @@ def test_global_takes_the_order_of_the_database(made: tuple[ReferenceMap, Seen])
     database = Database(8)
     where = Whereabouts(PositionPrior(made[0].positions[0], np.eye(3)), None, 0.5)
     of = search(made, database, where, ranking="global", count=3, box="fixed", half_side_m=70.0)
-    np.testing.assert_array_equal(of.ranked(of.box())[0], [7, 6, 5])
+    np.testing.assert_array_equal(of.ranked(of.box()).indices, [7, 6, 5])
     assert database.asked == [(3, 70.0, 0.5)]
 
 
 def test_votes_put_the_shortlist_in_order(made: tuple[ReferenceMap, Seen]) -> None:
     database = Database(8)
     of = search(made, database, ranking="global-votes", shortlist=6, heading_window_deg=180.0)
-    ranked, _ = of.ranked(of.box())
+    ranked = of.ranked(of.box()).indices
     assert database.asked == [(6, None, None)]
     assert sorted(ranked) == [2, 3, 4, 5, 6, 7]
-    all_votes, _ = search(made, ranking="votes").ranked(of.everywhere())
+    all_votes = search(made, ranking="votes").ranked(of.everywhere()).indices
     np.testing.assert_array_equal(ranked, [i for i in all_votes if i >= 2])
 
 
@@ -68,12 +68,14 @@ def test_without_a_database_only_votes_can_rank(made: tuple[ReferenceMap, Seen])
 
 def test_votes_among_some_say_which(made: tuple[ReferenceMap, Seen]) -> None:
     of = search(made, ranking="votes", max_searched=3)
-    ranked, note = of.ranked(of.everywhere())
-    assert (sorted(ranked), note) == ([0, 1, 2], "searched the first 3 of 8 references")
+    ranked = of.ranked(of.everywhere())
+    assert (sorted(ranked.indices), ranked.note) == ([0, 1, 2], "searched the first 3 of 8 references")
     of = search(made, None, Whereabouts(near=made[0].positions[6]), ranking="votes", max_searched=3)
-    ranked, note = of.ranked(of.everywhere())
-    assert 6 in ranked
-    assert note == "searched the nearest 3 of 8 references"
+    ranked = of.ranked(of.everywhere())
+    assert 6 in ranked.indices
+    assert ranked.note == "searched the nearest 3 of 8 references"
+    assert ranked.votes is not None
+    assert ranked.mean_votes(2) == np.mean(np.sort(ranked.votes)[1:])
 
 
 def test_what_similarity_missed_is_found_beside_the_pose(made: tuple[ReferenceMap, Seen]) -> None:
