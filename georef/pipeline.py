@@ -97,7 +97,7 @@ def _uses_map(config: Config) -> bool:
 
 STAGES: tuple[Stage, ...] = (
     Stage("features", 2, ("features",), _all_images, (), features.run),
-    Stage("network", 3, _NETWORK_KEYS, _reference_with_images, (), network.run, of_reference=True),
+    Stage("network", 4, _NETWORK_KEYS, _reference_with_images, (), network.run, of_reference=True),
     Stage("index", 1, ("retrieval",), _reference_with_images, (), index.run, _uses_index, of_reference=True),
     Stage(
         "global-map", 1, _MAP_KEYS, _reference_with_images, ("network",), global_map.run, _uses_map, of_reference=True
