@@ -6,9 +6,9 @@ the residuals say. A new image rests on neighbours and moves with them: for it o
 
 Residuals v of given orientations with errors e (covariance S) are v = (I - Q P) e - Q A' P_l l, with Q the cofactors
 and P the weights of the adjustment, and l the image noise: their covariance is known for any S. S = own + smooth, where
-the smooth part of two images is correlated by exp(-h^2 / 2 r^2) with h^2 = (distance / D)^2 + (angle / T)^2, D and T the
-usual distance and angle of an image to those it shares most with. Variances by maximum likelihood (Mardia and Marshall,
-Biometrika 1984).
+the smooth part of two images is correlated by exp(-h^2 / 2 r^2) with h^2 = (distance / D)^2 + (angle / T)^2, and D and
+T the usual distance and angle of an image to those it shares most with. Variances by maximum likelihood (Mardia and
+Marshall, Biometrika 1984).
 """
 
 from __future__ import annotations
