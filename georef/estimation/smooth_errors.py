@@ -17,6 +17,7 @@ from dataclasses import dataclass
 from typing import cast
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 from scipy.optimize import minimize
 from scipy.stats import chi2
@@ -53,7 +54,7 @@ class Residuals:
     cofactors: Array  # (6M, 6M) of the adjusted poses, in the same units
     distance: Array  # (M, M) m, between the images
     angle: Array  # (M, M) rad, between their attitudes
-    shared: Array  # (M, M) points that both see
+    shared: NDArray[np.integer]  # (M, M) points that both see
 
     @staticmethod
     def of(problem: Problem, solution: Solution, cofactors: Posterior) -> Residuals:

@@ -27,7 +27,7 @@ def residuals(seed: int, own: float, smooth: float) -> Residuals:
             difference[[i, i + reach]] = -1.0, 1.0
             relative += 40.0 * np.outer(difference, difference)
     information = np.kron(relative, np.eye(6))
-    cofactors = np.linalg.inv(information + np.eye(6 * IMAGES))
+    cofactors: Array = np.linalg.inv(information + np.eye(6 * IMAGES)).astype(np.float64)
     alike = np.exp(-0.5 * (distance / 12.0) ** 2) + 1e-9 * np.eye(IMAGES)
     error = own * rng.normal(size=(IMAGES, 6)) + smooth * np.linalg.cholesky(alike) @ rng.normal(size=(IMAGES, 6))
     values, vectors = np.linalg.eigh(information)
