@@ -7,7 +7,7 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
-from georef.cli_options import AS_DECLARED, Choice, Crs, Data, Epoch, Height, executor_of
+from georef.cli_options import AS_DECLARED, Choice, Crs, Data, Epoch, Height, Place, executor_of
 from georef.terminal import say, say_table
 
 
@@ -87,10 +87,9 @@ def _leave_one_out(
 ) -> int:
     from georef.comparison.leave_one_out import leave_out, write_leave_one_out
     from georef.comparison.run import Source
-    from georef.project import open_project
     from georef.stages.leave_one_out import Choice as Chosen
 
-    opened = open_project(project, data=data, output=output, preset=choice.preset, settings=choice.set_)
+    opened = Place(data, output).open(project, choice.preset, choice.set_)
     source = Source(project, data, output, epoch or next(iter(opened.file.epochs)), choice.preset, choice.set_)
     found = leave_out(source, Chosen(references, count), executor=executor_of(opened), say=say)
     say_table(found.table.to_dict())

@@ -59,7 +59,7 @@ def _all_images(project: Project, survey: Survey) -> dict[str, Any]:
     return {"images": _states_of(survey, survey.reference, survey.epoch)}
 
 
-def _reference_with_images(project: Project, survey: Survey) -> dict[str, Any]:
+def reference_with_images(project: Project, survey: Survey) -> dict[str, Any]:
     features_version = features.extractor_version(project.config.features)
     reference = {"features": features_version, "images": _states_of(survey, survey.reference)}
     return {**_reference_files(project, survey), **reference}
@@ -84,7 +84,7 @@ _NETWORK_KEYS = (
 )
 
 _MAP_KEYS = ("matching", "global_map", "candidates.epochs")
-_LOCALIZE_KEYS = ("matching", "candidates", "localize")
+LOCALIZE_KEYS = ("matching", "candidates", "localize")
 
 
 def _uses_index(config: Config) -> bool:
@@ -97,12 +97,12 @@ def _uses_map(config: Config) -> bool:
 
 STAGES: tuple[Stage, ...] = (
     Stage("features", 2, ("features",), _all_images, (), features.run),
-    Stage("network", 3, _NETWORK_KEYS, _reference_with_images, (), network.run, of_reference=True),
-    Stage("index", 1, ("retrieval",), _reference_with_images, (), index.run, _uses_index, of_reference=True),
+    Stage("network", 4, _NETWORK_KEYS, reference_with_images, (), network.run, of_reference=True),
+    Stage("index", 1, ("retrieval",), reference_with_images, (), index.run, _uses_index, of_reference=True),
     Stage(
-        "global-map", 1, _MAP_KEYS, _reference_with_images, ("network",), global_map.run, _uses_map, of_reference=True
+        "global-map", 1, _MAP_KEYS, reference_with_images, ("network",), global_map.run, _uses_map, of_reference=True
     ),
-    Stage("localize", 5, _LOCALIZE_KEYS, _epoch_files, ("features", "network", "index", "global-map"), localize.run),
+    Stage("localize", 5, LOCALIZE_KEYS, _epoch_files, ("features", "network", "index", "global-map"), localize.run),
     Stage("adjust", 5, ("adjust", "localize", "matching"), _control, ("features", "network", "localize"), adjust.run),
     Stage("report", 2, ("report",), _check, ("features", "network", "localize", "adjust"), report.run),
 )
@@ -127,14 +127,6 @@ class StageResult:
     timing: dict[str, float]
     reused: bool
     context: StageContext
-
-
-def leave_one_out_stages(choice: leave_one_out.Choice) -> tuple[Stage, ...]:
-    """What localizes chosen reference images against the others, and the stages that it needs."""
-    needed = tuple(stage for stage in STAGES if stage.name in ("features", "network", "index"))
-    name, reads, needs = leave_one_out.NAME, _reference_with_images, ("network", "index")
-    run, exist = partial(leave_one_out.run, choice), partial(leave_one_out.outcomes_exist, choice)
-    return *needed, Stage(name, 1, _LOCALIZE_KEYS, reads, needs, run, of_reference=True, results_exist=exist)
 
 
 def run_pipeline(

@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -16,14 +17,13 @@ import numpy as np
 
 from georef import __version__
 from georef.comparison.run import Say, Source
-from georef.estimation.reference_map import given_pose_cov
 from georef.evaluation.pose_errors import PoseErrors, summarize_errors
 from georef.evaluation.reliability import Reliability, median_nees_ratio, reliability
 from georef.evaluation.statistics import wilson_interval
 from georef.evaluation.tables import Cell, Column, Estimate, Table
 from georef.executor import Executor
 from georef.io.files import write_text_atomically
-from georef.pipeline import leave_one_out_stages, run_pipeline
+from georef.pipeline import LOCALIZE_KEYS, STAGES, Stage, reference_with_images, run_pipeline
 from georef.project import Project
 from georef.report.reliability_figure import Panel, reliability_figure
 from georef.stages import leave_one_out
@@ -33,7 +33,7 @@ from georef.stages.network import COMMON, read_noise
 from georef.types.campaign import Image
 from georef.types.results import Localized, ReferenceNoise, Rejected
 
-FOLDER = "leave-one-out"
+FOLDER = leave_one_out.NAME
 JSON, CSV, SVG = "leave-one-out.json", "leave-one-out.csv", "reliability.svg"
 _COLUMNS = (
     Column("name", ""),
@@ -108,12 +108,21 @@ class LeaveOneOut:
         }
 
 
+def stages_of(choice: Choice) -> tuple[Stage, ...]:
+    """What localizes chosen reference images against the others, and the stages that it needs."""
+    needed = tuple(stage for stage in STAGES if stage.name in ("features", "network", "index"))
+    run, exist = partial(leave_one_out.run, choice), partial(leave_one_out.outcomes_exist, choice)
+    reads, needs = reference_with_images, ("network", "index")
+    last = Stage(FOLDER, 1, LOCALIZE_KEYS, reads, needs, run, of_reference=True, results_exist=exist)
+    return *needed, last
+
+
 def leave_out(source: Source, choice: Choice, *, executor: Executor, say: Say) -> LeaveOneOut:
     """Localizes the chosen reference images against the others; finished ones are kept. Raises GeorefError."""
     project, epoch = source.open()
     choice.check(list(project.file.reference_epochs), project.config)
     context = None
-    for result in run_pipeline(project, epoch, executor, stages=leave_one_out_stages(choice)):
+    for result in run_pipeline(project, epoch, executor, stages=stages_of(choice)):
         kept = "kept" if result.reused else f"{result.timing['cpu_s']:.0f} CPU-s"
         say(f"  {result.stage:<13} {result.summary.line}  [{kept}]")
         context = result.context
@@ -124,14 +133,14 @@ def leave_out(source: Source, choice: Choice, *, executor: Executor, say: Say) -
 def of_context(choice: Choice, context: StageContext) -> LeaveOneOut:
     """What a finished stage `leave-one-out` has found."""
     noise, suspects = read_noise(context.before["network"])
-    outcomes = leave_one_out.read_outcomes(choice, context)
-    images = tuple(context.survey.reference[outcome.image_id] for outcome in outcomes)
+    compared = leave_one_out.read_compared(choice, context)
     results = []
-    for image, outcome in zip(images, outcomes, strict=True):
-        assert image.world_from_cam is not None
+    for c in compared:
+        outcome = c.outcome
         found = (outcome.world_from_cam, outcome.world_from_cam_cov) if isinstance(outcome, Localized) else None
-        results.append(reliability(image.image_id, found, image.world_from_cam, given_pose_cov(image, noise)))
-    rejected = tuple(outcome for outcome in outcomes if isinstance(outcome, Rejected))
+        results.append(reliability(outcome.image_id, found, c.given.world_from_cam, c.given.cov))
+    rejected = tuple(c.outcome for c in compared if isinstance(c.outcome, Rejected))
+    images = tuple(c.image for c in compared)
     return LeaveOneOut(context.project, choice, noise, suspects, images, tuple(results), rejected)
 
 

@@ -22,6 +22,7 @@ from georef.estimation.adjustment.posterior import posterior
 from georef.estimation.adjustment.problem import Orientation, Problem
 from georef.estimation.adjustment.solve import Solution, solution_views
 from georef.estimation.guided import GuidedOptions, PosedFeatures, epipolar_band, guided_matches
+from georef.estimation.smooth_errors import Residuals, SmoothErrors, smooth_errors
 from georef.estimation.tracks import (
     PairMatches,
     build_tracks,
@@ -52,6 +53,7 @@ class NetworkResult:
     noise: ReferenceNoise
     components: dict[str, Component]  # of the last round, factors near 1 where they were estimated
     suspects: tuple[int, ...]  # images whose given orientation contradicts the others
+    smooth: SmoothErrors | None  # of estimated sigmas: what neighbours share, which is no part of them
     images: int
     points: int
     observations: int
@@ -110,6 +112,7 @@ def estimate_noise(
 ) -> NetworkResult:
     """Sigmas of keypoints, and of reference positions and rotations where they are not declared.
 
+    Estimated ones are those of an image against its neighbours, without what these share (see `smooth_errors`).
     Raises StageError where the reference images share too little to say.
     """
     start = _uniform(_START_POSITION_M), _uniform(_START_ROTATION_RAD)
@@ -126,10 +129,18 @@ def estimate_noise(
             break
         suspects.append(worst)
         problem = _set_aside(_continued(adjusted, noise), [worst])
+    smooth = None
+    if declared is None:
+        residuals = Residuals.of(adjusted.problem, adjusted.solution, cofactors)
+        smooth = smooth_errors(residuals, noise.position_sigma_m[0], noise.rotation_sigma_rad[0])
+    if smooth is not None:
+        own = _uniform(smooth.own_position_m), _uniform(smooth.own_rotation_rad)
+        noise = replace(noise, position_sigma_m=own[0], rotation_sigma_rad=own[1])
     return NetworkResult(
         replace(noise, widening_angle_rad=widening_angle(adjusted.problem, adjusted.solution)),
         adjusted.components,
         tuple(suspects),
+        smooth,
         len(images),
         len(adjusted.problem.points),
         len(adjusted.problem.observations),

@@ -13,10 +13,12 @@ import numpy as np
 
 from georef.config import Config
 from georef.errors import ConfigError
+from georef.estimation.reference_map import given_pose_cov
 from georef.io.items import item_ids, item_path, read_outcome, write_outcome
 from georef.stages.base import StageContext, StageSummary, feature_id
 from georef.stages.localize import ITEMS, LocalizeTask, make_task, summary_of, usable_references
-from georef.types.campaign import Image
+from georef.stages.network import read_noise
+from georef.types.campaign import Image, PosePrior
 from georef.types.results import Outcome
 
 NAME = "leave-one-out"
@@ -96,6 +98,26 @@ def outcomes_exist(choice: Choice, context: StageContext) -> bool:
     """Whether every chosen image has a stored outcome."""
     items = context.folder / ITEMS
     return all(item_path(items, image.image_id).is_file() for image in choice.of(usable_references(context)))
+
+
+@dataclass(frozen=True, eq=False)
+class Compared:
+    """A left out image with its outcome and its given pose."""
+
+    image: Image
+    outcome: Outcome
+    given: PosePrior
+
+
+def read_compared(choice: Choice, context: StageContext) -> list[Compared]:
+    """The chosen images with their outcomes and given poses, whose covariances are declared or estimated."""
+    noise, _ = read_noise(context.before["network"])
+    out = []
+    for outcome in read_outcomes(choice, context):
+        image = context.survey.reference[outcome.image_id]
+        assert image.world_from_cam is not None
+        out.append(Compared(image, outcome, PosePrior(image.world_from_cam, given_pose_cov(image, noise))))
+    return out
 
 
 def read_outcomes(choice: Choice, context: StageContext) -> list[Outcome]:

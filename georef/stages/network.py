@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
@@ -27,6 +28,11 @@ RESULT = "reference.json"
 COMMON = (
     "What is common to all reference images (a shift, a rotation, a scale of the whole) leaves no residual among them "
     "and is not observable here; it is not part of any sigma in this report."
+)
+SHARED = (
+    "Given orientations and image matches disagree smoothly: by as much as this, neighbouring images deviate alike. "
+    "The reference is bent, or its cameras are held a little wrong. A new image rests on neighbours and moves with "
+    "them: this is no part of any sigma in this report, and shows in full between distant places."
 )
 
 
@@ -53,6 +59,11 @@ def run(context: StageContext) -> StageSummary:
         f"reference sigma {noise.source}: position {1e3 * noise.position_sigma_m[0]:.1f} mm, rotation "
         f"{np.degrees(noise.rotation_sigma_rad[0]):.4f} deg, from {result.points} points in {result.images} images"
     )
+    if result.smooth is not None:
+        line += (
+            f"; beside {1e3 * result.smooth.position_m:.1f} mm, {np.degrees(result.smooth.rotation_rad):.4f} deg that "
+            f"images within {result.smooth.reach_m:.0f} m and {np.degrees(result.smooth.reach_rad):.0f} deg share"
+        )
     if suspects:
         line += f"; set aside, in contradiction to the others: {', '.join(suspects)}"
     return StageSummary(line, data, len(chosen), len(chosen))
@@ -129,5 +140,6 @@ def _as_data(result: NetworkResult, suspects: list[str]) -> dict:
             name: {"factor": c.factor, "redundancy": c.redundancy, "observations": c.observations}
             for name, c in result.components.items()
         },
+        "shared_by_neighbours": None if result.smooth is None else {**asdict(result.smooth), "meaning": SHARED},
         "not_observable": COMMON,
     }

@@ -26,7 +26,7 @@ def judged(model: LocalModel) -> str:
 def part(low: tuple[float, float], high: tuple[float, float]) -> LocalModel:
     """The points that the query sees in a part of its image, from shares of its width and height."""
     share = RUN.query.pixels[RUN.model.keypoint] / [CAMERA.width, CAMERA.height]
-    return RUN.model.take(((share >= low) & (share <= high)).all(axis=1))
+    return RUN.model.take(np.asarray(((share >= low) & (share <= high)).all(axis=1)))
 
 
 def test_points_all_over_the_image_are_not_weak() -> None:
