@@ -41,8 +41,13 @@ class Matched:
 
     def take(self, views: Sequence[int]) -> Matched:
         """Some of them."""
-        parts = (self.references, self.matches, self.pose_covs, self.epochs)
-        return Matched(*([part[v] for v in views] for part in parts), self.keypoint_sigma)
+        return Matched(
+            [self.references[v] for v in views],
+            [self.matches[v] for v in views],
+            [self.pose_covs[v] for v in views],
+            [self.epochs[v] for v in views],
+            self.keypoint_sigma,
+        )
 
     def model(self) -> LocalModel:
         """The points that they agree on."""
