@@ -42,10 +42,13 @@ class Matched:
 
     def take(self, views: Sequence[int]) -> Matched:
         """Some of them."""
-        references, matches, epochs = (
-            [part[v] for v in views] for part in (self.references, self.matches, self.epochs)
+        return Matched(
+            [self.references[v] for v in views],
+            [self.matches[v] for v in views],
+            self.errors.take(views),
+            [self.epochs[v] for v in views],
+            self.keypoint_sigma,
         )
-        return Matched(references, matches, self.errors.take(views), epochs, self.keypoint_sigma)
 
     def model(self) -> LocalModel:
         """The points that they agree on."""
