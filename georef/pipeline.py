@@ -9,8 +9,9 @@ from __future__ import annotations
 import hashlib
 import json
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,7 @@ from georef.config import Config
 from georef.executor import Executor
 from georef.io.files import write_text_atomically
 from georef.project import Project
-from georef.stages import adjust, features, global_map, index, localize, network, report
+from georef.stages import adjust, features, global_map, index, leave_one_out, localize, network, report
 from georef.stages.base import Meter, Run, StageContext, StageSummary, feature_id
 from georef.stages.survey import Survey, load_survey
 from georef.types.campaign import Campaign
@@ -39,6 +40,7 @@ class Stage:
     run: Run
     wanted: Callable[[Config], bool] = lambda config: True
     of_reference: bool = False  # looks at the reference alone: done once for all epochs
+    results_exist: Callable[[StageContext], bool] | None = None  # where it is not known of the stage's name
 
 
 def _reference_files(project: Project, survey: Survey) -> dict[str, Any]:
@@ -127,10 +129,20 @@ class StageResult:
     context: StageContext
 
 
-def run_pipeline(project: Project, epoch: str, executor: Executor, last: str = "report") -> Iterator[StageResult]:
+def leave_one_out_stages(choice: leave_one_out.Choice) -> tuple[Stage, ...]:
+    """What localizes chosen reference images against the others, and the stages that it needs."""
+    needed = tuple(stage for stage in STAGES if stage.name in ("features", "network", "index"))
+    name, reads, needs = leave_one_out.NAME, _reference_with_images, ("network", "index")
+    run, exist = partial(leave_one_out.run, choice), partial(leave_one_out.outcomes_exist, choice)
+    return *needed, Stage(name, 1, _LOCALIZE_KEYS, reads, needs, run, of_reference=True, results_exist=exist)
+
+
+def run_pipeline(
+    project: Project, epoch: str, executor: Executor, last: str = "report", stages: Sequence[Stage] = STAGES
+) -> Iterator[StageResult]:
     """Runs what is not done, stage by stage up to the one named `last`. Raises GeorefError."""
     survey = load_survey(project, epoch)
-    plan = list(_plan(project, epoch, survey))  # as a whole: a component that cannot be made fails before any work
+    plan = list(_plan(project, epoch, survey, stages))  # as a whole: what cannot be made fails before any work
     for stage, folder, parts, before in plan:
         yield _run_stage(stage, StageContext(project, project.config, epoch, survey, executor, folder, before), parts)
         if stage.name == last:
@@ -146,13 +158,13 @@ def status(project: Project, epoch: str) -> list[StageState]:
 
 
 def _plan(
-    project: Project, epoch: str, survey: Survey
+    project: Project, epoch: str, survey: Survey, stages: Sequence[Stage] = STAGES
 ) -> Iterator[tuple[Stage, Path, dict[str, Any], dict[str, Path]]]:
     """Each stage with its folder, the parts of its fingerprint, and the folders of the stages before it."""
     prints: dict[str, str] = {}
     version = features.extractor_version(project.config.features)
     before = {"store": project.feature_folder / _hash(version)[:12]}
-    for stage in (stage for stage in STAGES if stage.wanted(project.config)):
+    for stage in (stage for stage in stages if stage.wanted(project.config)):
         parts = {
             "stage version": stage.version,
             "components": _components(stage, project.config),
@@ -177,12 +189,14 @@ def _components(stage: Stage, config: Config) -> str:
         return features.extractor_version(config.features)
     if stage.name == "index":
         return index.descriptor_version(config)
-    return localize.matcher_version(config) if stage.name in ("localize", "global-map") else ""
+    matching = ("localize", "global-map", leave_one_out.NAME)
+    return localize.matcher_version(config) if stage.name in matching else ""
 
 
 def _run_stage(stage: Stage, context: StageContext, parts: dict[str, Any]) -> StageResult:
     done = _read_json(context.folder / DONE)
-    if done is not None and _results_exist(context, stage.name):
+    exist = stage.results_exist or partial(_results_exist, stage=stage.name)
+    if done is not None and exist(context):
         summary = StageSummary(done["line"], done["data"], 0, done["total"])
         return StageResult(stage.name, summary, done["timing"], reused=True, context=context)
     context.folder.mkdir(parents=True, exist_ok=True)

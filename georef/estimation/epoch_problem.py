@@ -15,6 +15,7 @@ from georef.estimation.adjustment.problem import AutomaticGcps, Problem
 from georef.estimation.candidates import overlap
 from georef.estimation.guided import PosedFeatures, epipolar_distances
 from georef.estimation.local_model import triangulate_consistent
+from georef.estimation.reference_errors import point_by_reference_pose
 from georef.estimation.reference_map import ReferenceMap
 from georef.estimation.tracks import (
     PairMatches,
@@ -182,17 +183,15 @@ def _automatic_gcps(
     rays = replace(rays, view=rays.view - new_count)
     model = triangulate_consistent(views, np.arange(count), rays, _GCP_GATE_SIGMAS)
     obs = model.observations
-    lin = linearize(views, obs.view, model.points[obs.point])
-    pull = np.einsum("nki,nkj->nij", lin.by_point, lin.by_pose) / np.square(obs.sigma_px)[:, None, None]
     return AutomaticGcps(
         point=model.keypoint,
         position=model.points,
         cov=model.cov,
         ray_gcp=obs.point,
         ray_reference=obs.view,
-        by_reference_pose=-model.cov[obs.point] @ pull,
+        by_reference_pose=point_by_reference_pose(model),
         reference_ids=tuple(reference.images[i].image_id for i in used),
-        reference_covs=np.array([reference.pose_cov(i) for i in used]),
+        reference_errors=reference.errors(used),
     )
 
 

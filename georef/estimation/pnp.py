@@ -7,7 +7,6 @@ What is not known of the camera is estimated with the pose, whose covariance is 
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import cast
 
@@ -17,11 +16,11 @@ from scipy.stats import chi2
 
 from georef.estimation.first_pose import QueryImage
 from georef.estimation.local_model import LocalModel
+from georef.estimation.reference_errors import ReferenceErrors, reference_gains
 from georef.geometry.camera import Camera, intrinsic_derivatives
 from georef.geometry.covariance import symmetric
 from georef.geometry.projection import Views, linearize
 from georef.geometry.rigid import Array, Rigid3
-from georef.geometry.triangulation import segment_sum
 
 _ITERATIONS = 20
 _CONVERGED = 1e-9
@@ -45,13 +44,13 @@ def refine_pose(
     start: Rigid3,
     query: QueryImage,
     model: LocalModel,
-    reference_pose_cov: Callable[[int], Array],
+    reference_errors: ReferenceErrors,
     gate_probability: float = 0.999,
 ) -> EstimatedPose | None:
     """Refines a pose on all points of a local model: Cauchy, chi-square gate, then least squares on what passed.
 
     What query.camera does not know is refined with it, from its values.
-    reference_pose_cov(i) is the covariance (6, 6) of the model's i-th reference view. None where geometry fails.
+    reference_errors: of the model's views. None where geometry fails.
     """
     found = _iterate(start, query, model, np.ones(len(model), bool), robust=True)
     if found is None:
@@ -68,16 +67,16 @@ def refine_pose(
         found, inliers = refitted, gated
         if settled:
             break
-    return with_covariance(*found, model, inliers, reference_pose_cov)
+    return with_covariance(*found, model, inliers, reference_errors)
 
 
 def refit_pose(
-    start: Rigid3, query: QueryImage, model: LocalModel, reference_pose_cov: Callable[[int], Array]
+    start: Rigid3, query: QueryImage, model: LocalModel, reference_errors: ReferenceErrors
 ) -> EstimatedPose | None:
     """Least squares on all points of a local model, which are known to be good. None where geometry fails."""
     everything = np.ones(len(model), bool)
     found = _iterate(start, query, model, everything, robust=False)
-    return None if found is None else with_covariance(*found, model, everything, reference_pose_cov)
+    return None if found is None else with_covariance(*found, model, everything, reference_errors)
 
 
 def with_covariance(
@@ -85,7 +84,7 @@ def with_covariance(
     query: QueryImage,
     model: LocalModel,
     inliers: NDArray[np.bool_],
-    reference_pose_cov: Callable[[int], Array],
+    reference_errors: ReferenceErrors,
 ) -> EstimatedPose | None:
     """The covariance of a pose estimated from the inliers: image noise, map points, and reference poses.
 
@@ -100,7 +99,8 @@ def with_covariance(
     squares = float(np.einsum("ni,nij,nj->", system.residual, system.weight, system.residual))
     variance_factor = squares / max(2 * len(used) - len(normal), 1)
     relative = symmetric(variance_factor * cov_unit)
-    cov = symmetric(relative + _shared_reference_part(system, cov_unit, used, reference_pose_cov))
+    by_point = -cov_unit @ np.swapaxes(system.by_unknown, 1, 2) @ system.weight @ system.by_point  # (P, 6 + q, 3)
+    cov = symmetric(relative + reference_errors.propagated(reference_gains(used, by_point)))
     return EstimatedPose(
         pose,
         cov[:6, :6],
@@ -192,26 +192,6 @@ def _gate(
     statistic = np.einsum("ni,nij,nj->n", system.residual, np.linalg.pinv(cofactor, hermitian=True), system.residual)
     scale2 = float(np.median(statistic[inliers])) / chi2.ppf(0.5, 2)
     return statistic <= max(scale2, 1e-12) * chi2.ppf(probability, 2)
-
-
-def _shared_reference_part(
-    system: _Weighted, cov_unit: Array, model: LocalModel, reference_pose_cov: Callable[[int], Array]
-) -> Array:
-    """Covariance (6 + q, 6 + q) that the errors of the reference poses bring.
-
-    Points that share a reference move together: a reference pose error e moves a point by -N^-1 sum(A' W B) e, with A
-    and B the derivatives of its observations by point and pose; the query pose follows by its own normal equations.
-    """
-    obs = model.observations
-    lin = linearize(model.views, obs.view, model.points[obs.point])
-    pull = np.einsum("nki,nkj->nij", lin.by_point, lin.by_pose) / np.square(obs.sigma_px)[:, None, None]
-    point_by_pose = model.cov[obs.point] @ pull  # (n, 3, 6)
-    gain = cov_unit @ np.swapaxes(system.by_unknown, 1, 2) @ system.weight @ system.by_point  # (P, 6 + q, 3)
-    by_reference = segment_sum(gain[obs.point] @ point_by_pose, obs.view, len(model.views))
-    return sum(
-        (c @ reference_pose_cov(i) @ c.T for i, c in enumerate(by_reference)),
-        start=np.zeros_like(cov_unit),
-    )
 
 
 def _inverse(normal: Array) -> Array | None:

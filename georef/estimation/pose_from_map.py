@@ -44,13 +44,13 @@ def _posed_by_ransac(query: Query, model: LocalModel, chosen: Sequence[int]) -> 
         found = consensus(query, model)
         if isinstance(found, Rejected):
             return found
-        pose, covs = found.world_from_cam, lambda v: query.reference.pose_cov(chosen[v])
+        pose, errors = found.world_from_cam, query.reference.errors(chosen)
         used = one_point_each(pose, query.observed, model, found.inliers)
         if query.image.camera.estimate:  # COLMAP has estimated no covariance, and no distortion
             model = model.take(used)
-            estimate = refine_pose(pose, query.observed, model, covs)
+            estimate = refine_pose(pose, query.observed, model, errors)
         else:
-            estimate = with_covariance(pose, query.observed, model, used, covs)
+            estimate = with_covariance(pose, query.observed, model, used, errors)
     return outcome_of(query, estimate, model, chosen)
 
 

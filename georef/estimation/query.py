@@ -118,7 +118,7 @@ def _thinned(
     order = np.random.default_rng(query.config.seed).permutation(len(model))
     model = model.take(np.isin(np.arange(len(model)), order[: query.config.max_correspondences]))
     observed = query.observed.with_camera(estimate.camera)
-    refined = refit_pose(estimate.world_from_cam, observed, model, lambda v: query.reference.pose_cov(chosen[v]))
+    refined = refit_pose(estimate.world_from_cam, observed, model, query.reference.errors(chosen))
     return model, refined or estimate
 
 

@@ -41,7 +41,7 @@ def _guided_pose(query: Query, pose: Rigid3, chosen: Sequence[int]) -> tuple[Est
     with query.timed("pose"):
         references = [query.reference.posed(i) for i in chosen]
         model = query_centred_model(references, matches, query.reference.noise.keypoint_sigma)
-        return refine_pose(pose, query.observed, model, lambda v: query.reference.pose_cov(chosen[v])), model
+        return refine_pose(pose, query.observed, model, query.reference.errors(chosen)), model
 
 
 def _first_pose(query: Query, indices: list[int]) -> tuple[Rigid3, LocalModel] | Rejected:
@@ -59,9 +59,7 @@ def _first_pose(query: Query, indices: list[int]) -> tuple[Rigid3, LocalModel] |
         model = model.take(found.inliers)
         if not query.image.camera.estimate:
             return found.world_from_cam, model
-        refined = refine_pose(
-            found.world_from_cam, query.observed, model, lambda v: query.reference.pose_cov(indices[v])
-        )
+        refined = refine_pose(found.world_from_cam, query.observed, model, query.reference.errors(indices))
         if refined is None:
             detail = f"{len(model)} points do not fix the pose and the camera"
             return Rejected(query.image.image_id, RejectReason.DEGENERATE, detail)

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
+from copy import copy
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from georef.estimation.guided import PosedFeatures
+from georef.estimation.reference_errors import ReferenceErrors
 from georef.geometry.angles import heading_of
 from georef.geometry.projection import Views
 from georef.geometry.rigid import Array, Rigid3
@@ -45,23 +47,37 @@ class ReferenceMap:
         self.headings_rad: Array = np.array([heading_of(pose.rotation) for pose in self.poses])  # NaN: up or down
         self._pairs: OrderedDict[tuple[int, int], Any] = OrderedDict()
         self._read, self._read_structure = read_features, read_structure
-        self._heads: OrderedDict[tuple[int, int], Features] = OrderedDict()
-        self._posed: OrderedDict[int, PosedFeatures] = OrderedDict()
+        self._heads: OrderedDict[tuple[str, int], Features] = OrderedDict()
+        self._posed: OrderedDict[str, PosedFeatures] = OrderedDict()
         self._structures: OrderedDict[int, ImageStructure] = OrderedDict()
 
     def __len__(self) -> int:
         return len(self.images)
 
+    def without(self, left_out: Collection[str]) -> ReferenceMap:
+        """The map without some images (ids), the others in their order; features read so far are shared.
+
+        A precomputed map is left behind: its points rest on all images.
+        """
+        keep = [i for i, image in enumerate(self.images) if image.image_id not in left_out]
+        part = copy(self)
+        part.images = tuple(self.images[i] for i in keep)
+        part.poses = [self.poses[i] for i in keep]
+        part.positions, part.headings_rad = self.positions[keep], self.headings_rad[keep]
+        part._pairs, part._structures, part._read_structure = OrderedDict(), OrderedDict(), None
+        return part
+
     def head(self, index: int, count: int) -> Features:
         """The best `count` features of a reference image."""
-        return _remember(self._heads, (index, count), 4096, lambda: self._read(self.images[index].image_id, count))
+        image_id = self.images[index].image_id
+        return _remember(self._heads, (image_id, count), 4096, lambda: self._read(image_id, count))
 
     def posed(self, index: int) -> PosedFeatures:
         """All features of a reference image with its pose."""
         image = self.images[index]
         return _remember(
             self._posed,
-            index,
+            image.image_id,
             _KEPT_IMAGES,
             lambda: PosedFeatures.of(self._read(image.image_id, None), image.camera, self.poses[index]),
         )
@@ -81,12 +97,25 @@ class ReferenceMap:
         return Views.of([self.poses[i] for i in indices], [self.images[i].camera for i in indices])
 
     def pose_cov(self, index: int) -> Array:
-        """Covariance (6, 6) of a reference pose: as it is declared for its epoch, else as estimated for all."""
-        given = self.images[index].given_sigma
-        noise = self.noise
-        if given is not None and noise.source == "declared":
-            noise = replace(noise, position_sigma_m=given.position_m, rotation_sigma_rad=given.rotation_rad)
-        return noise.pose_cov(self.poses[index])
+        """Covariance (6, 6) of a reference pose."""
+        return given_pose_cov(self.images[index], self.noise)
+
+    def errors(self, indices: Sequence[int]) -> ReferenceErrors:
+        """The errors of reference poses; images of one station share theirs."""
+        images = [self.images[i] for i in indices]
+        stations = [None if image.station is None else (image.epoch, image.station) for image in images]
+        return ReferenceErrors.of_stations(
+            [self.poses[i] for i in indices], [self.pose_cov(i) for i in indices], stations
+        )
+
+
+def given_pose_cov(image: Image, noise: ReferenceNoise) -> Array:
+    """Covariance (6, 6) of a reference image's given pose: as declared for its epoch, else as estimated for all."""
+    assert image.world_from_cam is not None
+    given = image.given_sigma
+    if given is not None and noise.source == "declared":
+        noise = replace(noise, position_sigma_m=given.position_m, rotation_sigma_rad=given.rotation_rad)
+    return noise.pose_cov(image.world_from_cam)
 
 
 def _remember(cache: OrderedDict, key: object, size: int, make: Callable):

@@ -188,7 +188,7 @@ def compare_poses(
         raise ValueError(f"images without a true pose cannot be judged: {unknown[:5]}")
     truth_cov = (truth_sigmas or TruthSigmas()).cov
     errors = tuple(pose_error(name, estimated.get(name), truth[name], truth_cov) for name in names)
-    return _summarize(errors, tuple(name for name in estimated if name not in truth))
+    return summarize_errors(errors, tuple(name for name in estimated if name not in truth))
 
 
 def pose_error(image_id: str, estimate: PoseWithCov | None, truth: Rigid3, truth_cov: Array) -> PoseError:
@@ -211,7 +211,8 @@ def pose_error(image_id: str, estimate: PoseWithCov | None, truth: Rigid3, truth
     return PoseError(image_id, offset, length, angle, *parts)
 
 
-def _summarize(errors: tuple[PoseError, ...], without_truth: tuple[str, ...]) -> PoseErrors:
+def summarize_errors(errors: tuple[PoseError, ...], without_truth: tuple[str, ...] = ()) -> PoseErrors:
+    """The errors of images and their summary; without_truth: estimates that could not be compared."""
     position_m = np.array([error.position_m for error in errors])
     rotation_deg = np.rad2deg([error.rotation_rad for error in errors])
     offsets = np.array([error.offset_m for error in errors if error.offset_m is not None])

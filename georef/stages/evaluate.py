@@ -82,14 +82,33 @@ def write_evaluation(evaluation: Evaluation, path: Path | None = None) -> Path:
     return path
 
 
-def one_of(project: Path | None, poses: Path | None) -> None:
-    """Raises ConfigError unless either a project or a file of poses is named."""
+def what_to_compare(
+    project: Path | None, poses: Path | None, truth: Path | None, *, leave_one_out: bool, chosen: bool
+) -> None:
+    """Raises ConfigError unless the options go together: a project or poses with a truth, or a project without."""
+    if leave_one_out:
+        if project is None or poses is not None or truth is not None:
+            what = "no project" if project is None else "--poses" if poses is not None else "--truth"
+            raise ConfigError(
+                f"--leave-one-out is given with {what}.",
+                "Expected a project alone, whose reference images are compared with their given poses: "
+                "georef evaluate PROJECT --leave-one-out.",
+            )
+        return
+    if chosen:
+        raise ConfigError("--references and --count choose among left out images.", "Add --leave-one-out.")
     if (project is None) == (poses is None):
         raise ConfigError(
             "Neither a project nor a file of poses is named."
             if poses is None
             else "Both a project and --poses are named.",
             "Expected one of them: georef evaluate PROJECT --truth FILE, or --poses FILE --truth FILE.",
+        )
+    if truth is None:
+        raise ConfigError(
+            "There is nothing to compare with.",
+            "Name the true exterior orientation with --truth FILE; or, of a project, compare its reference images with "
+            "each other: --leave-one-out.",
         )
 
 

@@ -70,10 +70,14 @@ class LocalizeTask:
         return _matcher(self.config)
 
     def __call__(self, image: Image) -> Outcome:
+        return self.localized(image, self.map, self.similar)
+
+    def localized(self, image: Image, reference: ReferenceMap, index: SimilarImages | None) -> Outcome:
+        """The outcome of an image against a reference map, by the search in the vector database that belongs to it."""
         failure = self.failed.get(feature_id(image))
         if failure is not None:
             return Rejected(image.image_id, RejectReason(failure[0]), failure[1])
-        index, reference, matcher = self.similar, self.map, self.matcher  # what keeps them from loading ends the run
+        matcher = self.matcher  # what keeps it from loading ends the run, and so with map and index
         try:
             features = open_features(self.store_folder).read(feature_id(image))
             similar = None if index is None else index.to_image(image, features)
@@ -104,25 +108,26 @@ def run(context: StageContext) -> StageSummary:
     for outcome in context.executor.map_items(task, pending, "localize"):
         write_outcome(item_path(folder, outcome.image_id), outcome)
     outcomes = read_outcomes(context.folder, context.survey.epoch)
-    return _summary(outcomes, len(pending))
+    return summary_of(outcomes, len(pending))
 
 
 def make_task(context: StageContext) -> LocalizeTask:
     """The reference as it takes part: of the chosen epochs, without suspects and what has no features."""
     epochs = set(context.config.candidates.epochs or context.project.file.reference_epochs)
-    noise, suspects = read_noise(context.before["network"])
-    failed = failed_images(context.before["features"])
-    reference = context.survey.reference
-    usable = tuple(
-        image
-        for image in reference.images
-        if image.epoch in epochs and image.image_id not in suspects and feature_id(image) not in failed
-    )
+    usable = tuple(image for image in usable_references(context) if image.epoch in epochs)
     if len(usable) < 2:
         raise StageError(f"Only {len(usable)} reference images can be used, at least two are needed.")
-    campaign, folders = Campaign(reference.epoch, usable), context.before
+    campaign, folders = Campaign(context.survey.reference.epoch, usable), context.before
+    noise, failed = read_noise(folders["network"])[0], failed_images(folders["features"])
     index, precomputed = folders.get("index"), folders.get("global-map")
     return LocalizeTask(campaign, noise, folders["store"], context.config, failed, index, precomputed)
+
+
+def usable_references(context: StageContext) -> list[Image]:
+    """The reference images of all epochs that have features and do not contradict the others."""
+    suspects, failed = read_noise(context.before["network"])[1], failed_images(context.before["features"])
+    images = context.survey.reference.images
+    return [i for i in images if i.image_id not in suspects and feature_id(i) not in failed]
 
 
 def outcomes_exist(context: StageContext) -> bool:
@@ -136,7 +141,8 @@ def read_outcomes(folder: Path, epoch: Campaign) -> list[Outcome]:
     return [read_outcome(item_path(folder / ITEMS, image.image_id)) for image in epoch.images]
 
 
-def _summary(outcomes: list[Outcome], computed: int) -> StageSummary:
+def summary_of(outcomes: list[Outcome], computed: int) -> StageSummary:
+    """Outcomes in a line, and in figures."""
     localized = [o for o in outcomes if isinstance(o, Localized)]
     rejected = Counter(o.reason.value for o in outcomes if isinstance(o, Rejected))
     line = f"{len(localized)} of {len(outcomes)} images localized"

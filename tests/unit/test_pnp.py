@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 import pytest
 from scipy.stats import chi2
@@ -11,7 +9,8 @@ from scipy.stats import chi2
 from georef.estimation.first_pose import QueryImage, ransac_pose
 from georef.estimation.local_model import LocalModel, query_centred_model
 from georef.estimation.pnp import EstimatedPose, refine_pose, with_covariance
-from georef.geometry.rigid import Array, Rigid3
+from georef.estimation.reference_errors import ReferenceErrors
+from georef.geometry.rigid import Rigid3
 from georef.types.results import ReferenceNoise
 from tests.worlds.points import (
     CAMERA,
@@ -54,11 +53,10 @@ class Run:
         self.start = nearby(self.truth, rng)
         self.noise = noise
 
-    def pose_cov(self, view: int) -> Array:
-        return self.noise.pose_cov(self.given[view])
+        self.errors = ReferenceErrors.independent([noise.pose_cov(pose) for pose in self.given])
 
-    def estimate(self, pose_cov: Callable[[int], Array] | None = None) -> EstimatedPose:
-        estimate = refine_pose(self.start, self.query, self.model, pose_cov or self.pose_cov)
+    def estimate(self, errors: ReferenceErrors | None = None) -> EstimatedPose:
+        estimate = refine_pose(self.start, self.query, self.model, errors or self.errors)
         assert estimate is not None
         return estimate
 
@@ -75,7 +73,11 @@ def test_covariance_holds_with_shared_reference_errors_and_not_without_them() ->
         run = Run(world, rng)
         estimate = run.estimate()
         alone = with_covariance(
-            estimate.world_from_cam, run.query, run.model, estimate.inliers, lambda _: np.zeros((6, 6))
+            estimate.world_from_cam,
+            run.query,
+            run.model,
+            estimate.inliers,
+            ReferenceErrors.independent(np.zeros((5, 6, 6))),
         )
         assert alone is not None
         np.testing.assert_allclose(alone.cov, estimate.relative_cov, rtol=1e-12)
@@ -128,7 +130,7 @@ def test_sigma0_shows_understated_keypoint_noise_and_the_covariance_follows() ->
     model = LocalModel(
         run.model.keypoint, run.model.points, run.model.cov / 4.0, run.model.views, run.model.observations
     )
-    honest, understated = run.estimate(), refine_pose(run.start, stated, model, run.pose_cov)
+    honest, understated = run.estimate(), refine_pose(run.start, stated, model, run.errors)
     assert understated is not None
     assert understated.sigma0 == pytest.approx(2.0 * honest.sigma0, rel=0.05)
     np.testing.assert_allclose(understated.relative_cov, honest.relative_cov, rtol=0.15, atol=1e-9)
@@ -164,9 +166,9 @@ def test_no_pose_from_too_few_points_or_points_in_one_place() -> None:
     run = Run(court(8), np.random.default_rng(18))
     few = run.model.take(np.arange(len(run.model)) < 3)
     assert ransac_pose(run.query, few, gate_px=12.0, seed=0) is None
-    assert refine_pose(run.start, run.query, few, run.pose_cov) is None
+    assert refine_pose(run.start, run.query, few, run.errors) is None
     nothing = run.model.take(np.zeros(len(run.model), bool))
     assert ransac_pose(run.query, nothing, gate_px=12.0, seed=0) is None
     same = np.repeat(run.model.points[:1], len(run.model), axis=0)
     collapsed = LocalModel(run.model.keypoint, same, run.model.cov, run.model.views, run.model.observations)
-    assert refine_pose(run.start, run.query, collapsed, run.pose_cov) is None
+    assert refine_pose(run.start, run.query, collapsed, run.errors) is None

@@ -12,6 +12,7 @@ from scipy.stats import chi2
 from georef.estimation.first_pose import QueryImage, ransac_pose
 from georef.estimation.local_model import query_centred_model
 from georef.estimation.pnp import EstimatedPose, refine_pose
+from georef.estimation.reference_errors import ReferenceErrors
 from georef.evaluation.statistics import nees
 from georef.geometry.camera import Camera
 from georef.geometry.rigid import Array
@@ -67,7 +68,8 @@ class Draw:
         if found is None:
             return None
         query = self.query(found.camera)
-        return refine_pose(found.world_from_cam, query, self.model, lambda i: _EXACT.pose_cov(self.given[i]))
+        errors = ReferenceErrors.independent([_EXACT.pose_cov(pose) for pose in self.given])
+        return refine_pose(found.world_from_cam, query, self.model, errors)
 
 
 def interval(dof: float, tail: float = 0.005) -> tuple[float, float]:

@@ -103,7 +103,7 @@ def relative(ours: Array, theirs: Array) -> float:
 def with_moved_gcps(made: Block, rng: np.random.Generator) -> Problem:
     """The problem as other errors of the reference poses would have made it: all GCPs of a reference move together."""
     gcps = made.problem.gcps
-    error = np.array([np.linalg.cholesky(cov) @ rng.normal(size=6) for cov in gcps.reference_covs])
+    error = gcps.reference_errors.draw(rng)
     moved = np.einsum("nij,nj->ni", gcps.by_reference_pose, error[gcps.ray_reference])
     position = gcps.position.copy()
     np.add.at(position, gcps.ray_gcp, moved)

@@ -119,7 +119,8 @@ def _eliminate(
 def _shared_reference_part(problem: Problem, tie: _Eliminated, cov: Array) -> Array:
     """What the errors of the reference poses add (6M, 6M): dx = -Q W N_pp^-1 P dX, with dX = sum over references B e.
 
-    The weights P know the image noise of an automatic GCP alone; a reference moves all its GCPs together.
+    The weights P know the image noise of an automatic GCP alone; a reference moves all its GCPs together, and so
+    does a station of references.
     """
     gcps = problem.gcps
     if not len(gcps):
@@ -129,8 +130,7 @@ def _shared_reference_part(problem: Problem, tie: _Eliminated, cov: Array) -> Ar
     shape = (len(problem.points), len(gcps.reference_ids))
     moved = _block_matrix(np.swapaxes(weighted, 1, 2), gcps.ray_reference, points, shape[1], shape[0])
     gain = cov @ _dense(moved @ tie.solved).T
-    blocks = gain.reshape(len(cov), shape[1], 6)
-    return symmetric(np.einsum("irk,rkl,jrl->ij", blocks, gcps.reference_covs, blocks, optimize=True))
+    return gcps.reference_errors.propagated(np.swapaxes(gain.reshape(len(cov), shape[1], 6), 0, 1))
 
 
 def _block_matrix(

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from georef.estimation.reference_errors import ReferenceErrors
 from georef.geometry.camera import Camera
 from georef.geometry.covariance import pose_cov_from_parts
 from georef.geometry.projection import Views
@@ -51,7 +52,7 @@ class AutomaticGcps:
     ray_reference: NDArray[np.int64]  # (n,) and which reference
     by_reference_pose: Array  # (n, 3, 6) derivative of the position
     reference_ids: tuple[str, ...]
-    reference_covs: Array  # (R, 6, 6)
+    reference_errors: ReferenceErrors  # of the R references
 
     def __len__(self) -> int:
         return len(self.point)
@@ -60,7 +61,8 @@ class AutomaticGcps:
     def none() -> AutomaticGcps:
         empty = np.zeros(0, np.int64)
         zero = np.zeros
-        return AutomaticGcps(empty, zero((0, 3)), zero((0, 3, 3)), empty, empty, zero((0, 3, 6)), (), zero((0, 6, 6)))
+        nobody = ReferenceErrors.independent(zero((0, 6, 6)))
+        return AutomaticGcps(empty, zero((0, 3)), zero((0, 3, 3)), empty, empty, zero((0, 3, 6)), (), nobody)
 
     def take(self, keep: NDArray[np.bool_], renumber: NDArray[np.int64]) -> AutomaticGcps:
         """The GCPs to keep (K,), their points renumbered by (P,)."""
