@@ -17,9 +17,10 @@ from numpy.typing import NDArray
 
 from georef.estimation.guided import PosedFeatures
 from georef.estimation.local_model import triangulate_consistent
+from georef.estimation.reference_errors import point_by_reference_pose
 from georef.estimation.reference_map import ReferenceMap
 from georef.estimation.tracks import PairMatches, build_tracks, distributed
-from georef.geometry.projection import Views, linearize
+from georef.geometry.projection import Views
 from georef.geometry.rigid import Array, Rigid3
 from georef.geometry.triangulation import triangulate
 from georef.types.campaign import Mounting
@@ -55,6 +56,7 @@ class StationProblem:
     observations: Observations  # in the members; view is the index of a member
     ray_point: NDArray[np.int64]  # (n,) of each reference ray: its point
     ray_reference: NDArray[np.int64]  # (n,) index in the reference map
+    ray_keypoint: NDArray[np.int64]  # (n,) keypoint in that reference
     by_reference_pose: Array  # (n, 3, 6) derivative of the point by the pose of that reference
 
     @cached_property
@@ -65,9 +67,7 @@ class StationProblem:
 
     def scaled(self, factor: float) -> StationProblem:
         """The same problem with all keypoint noise scaled."""
-        return replace(
-            self, observations=self.observations.scaled(factor), prior_cov=self.prior_cov * factor**2
-        )
+        return replace(self, observations=self.observations.scaled(factor), prior_cov=self.prior_cov * factor**2)
 
     def started(self, world_from_rigs: Sequence[Rigid3]) -> StationProblem:
         """The same problem with other approximate stations."""
@@ -87,7 +87,9 @@ def station_problem(
     used = sorted({index[m.reference_id] for member in members for m in member.matches})
     place = {i: len(members) + k for k, i in enumerate(used)}
     to_references = [
-        PairMatches(n, place[index[m.reference_id]], m.indices) for n, member in enumerate(members) for m in member.matches
+        PairMatches(n, place[index[m.reference_id]], m.indices)
+        for n, member in enumerate(members)
+        for m in member.matches
     ]
     posed = [_at(member, world_from_rigs) for member in members]
     images = [*posed, *(reference.posed(i) for i in used)]
@@ -113,6 +115,7 @@ def station_problem(
         observations=seen.with_points(number[seen.point]),
         ray_point=number[rays.point[ray_kept]],
         ray_reference=rays.reference[ray_kept],
+        ray_keypoint=rays.keypoint[ray_kept],
         by_reference_pose=rays.by_pose[ray_kept],
     )
 
@@ -132,6 +135,7 @@ class _Points:
 class _Rays:
     point: NDArray[np.int64]
     reference: NDArray[np.int64]
+    keypoint: NDArray[np.int64]
     by_pose: Array  # (n, 3, 6)
 
 
@@ -141,15 +145,13 @@ def _from_references(
     """The points that at least two references agree on, and how these depend on the references' poses."""
     given, cov, known = np.zeros((count, 3)), np.zeros((count, 3, 3)), np.zeros(count, bool)
     if not len(rays):
-        return _Points(given, cov, known), _Rays(rays.point, rays.view, np.zeros((0, 3, 6)))
+        return _Points(given, cov, known), _Rays(rays.point, rays.view, rays.keypoint, np.zeros((0, 3, 6)))
     views = reference.views(used)
     model = triangulate_consistent(views, np.arange(count), replace(rays, view=rays.view - members), _GATE_SIGMAS)
     given[model.keypoint], cov[model.keypoint], known[model.keypoint] = model.points, model.cov, True
-    obs = model.observations
-    lin = linearize(views, obs.view, model.points[obs.point])
-    pull = np.einsum("nki,nkj->nij", lin.by_point, lin.by_pose) / np.square(obs.sigma_px)[:, None, None]
-    by_pose = -model.cov[obs.point] @ pull
-    return _Points(given, cov, known), _Rays(model.keypoint[obs.point], np.asarray(used)[obs.view], by_pose)
+    obs, by_pose = model.observations, point_by_reference_pose(model)
+    of_rays = _Rays(model.keypoint[obs.point], np.asarray(used)[obs.view], obs.keypoint, by_pose)
+    return _Points(given, cov, known), of_rays
 
 
 def _tie_points(

@@ -8,13 +8,14 @@ a position from the references weights its observation as sigma^2 + B C B', as t
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
+from georef.estimation.reference_map import ReferenceMap
 from georef.estimation.station_problem import StationProblem
 from georef.geometry.covariance import symmetric
 from georef.geometry.projection import Linearized, Views, linearize
@@ -47,15 +48,20 @@ class SolvedStations:
     state: State
     inliers: NDArray[np.bool_]  # (n,) of the observations
     cofactors: Array  # (U, U) image noise and calibration: against the reference as it is published
-    by_reference: dict[int, Array]  # gains (U, 6) of the error of each reference pose, by its index in the map
+    references: NDArray[np.int64]  # (R,) indices in the reference map of those that the points rest on
+    gains: Array  # (R, U, 6) of the errors of their poses
     sigma0: float  # a-posteriori over a-priori standard deviation of an observation
 
-    def chain(self, member: int) -> Array:
-        """Derivative (6, U) of a member's pose by all unknowns."""
-        return chains(self.problem, self.state)[member]
+    def poses(self) -> list[Rigid3]:
+        """world_from_cam (M) of all members."""
+        return member_poses(self.problem, self.state)
 
-    def world_from_cam(self, member: int) -> Rigid3:
-        return member_poses(self.problem, self.state)[member]
+    def covs(self, reference: ReferenceMap) -> tuple[Array, Array]:
+        """Pose covariances (M, 6, 6) of the members: with the errors of the reference, and without them."""
+        by_unknowns = chains(self.problem, self.state)
+        shared = reference.errors([int(i) for i in self.references]).propagated(self.gains)
+        both = (by_unknowns @ cov @ np.swapaxes(by_unknowns, 1, 2) for cov in (self.cofactors + shared, self.cofactors))
+        return symmetric(next(both)), symmetric(next(both))
 
 
 def solve_stations(problem: StationProblem, gate_probability: float = 0.999) -> SolvedStations | None:
@@ -144,7 +150,9 @@ class _System:
         blocks = segment_sum(transposed @ by_point * information[:, None, None], obs.point, count) + prior
         inverse = _block_inverse(blocks)
         off = np.einsum("nki,nk->ni", by_point, residual) * information[:, None]
-        point_gradient = segment_sum(off, obs.point, count) + np.einsum("pij,pj->pi", prior, state.points - problem.given)
+        point_gradient = segment_sum(off, obs.point, count) + np.einsum(
+            "pij,pj->pi", prior, state.points - problem.given
+        )
         mixed = segment_sum(np.swapaxes(weighted, 1, 2) @ by_point, obs.point, count)
         solved = mixed @ inverse
         flat_solved, size = _flat(solved), by_unknown.shape[2]
@@ -152,9 +160,7 @@ class _System:
         normal = flat_weighted @ by_unknown.reshape(-1, size) - flat_solved @ _flat(mixed).T
         gradient = flat_weighted @ residual.ravel() - flat_solved @ point_gradient.ravel()
         _add_calibration(problem, state, normal, gradient)
-        return _System(
-            lin, by_unknown, residual, information, inverse, mixed, solved, point_gradient, normal, gradient
-        )
+        return _System(lin, by_unknown, residual, information, inverse, mixed, solved, point_gradient, normal, gradient)
 
 
 def _flat(blocks: Array) -> Array:
@@ -287,8 +293,8 @@ def _with_covariance(problem: StationProblem, state: State, inliers: NDArray[np.
     cofactors = _inverse(system.normal)
     if cofactors is None:
         return None
-    gains = _reference_gains(problem, system, cofactors)
-    return SolvedStations(problem, state, inliers, symmetric(cofactors), gains, sigma0)
+    references, gains = _reference_gains(problem, system, cofactors)
+    return SolvedStations(problem, state, inliers, symmetric(cofactors), references, gains, sigma0)
 
 
 def _variance_factor(problem: StationProblem, state: State, inliers: NDArray[np.bool_]) -> float:
@@ -310,18 +316,15 @@ def _variance_factor(problem: StationProblem, state: State, inliers: NDArray[np.
     return float(squares) / max(redundancy, 1)
 
 
-def _reference_gains(problem: StationProblem, system: _System, cofactors: Array) -> dict[int, Array]:
-    """Gains (U, 6) of the error of each reference pose: dx = -Q E N_pp^-1 C^-1 dX, with dX = sum over its rays B e.
+def _reference_gains(problem: StationProblem, system: _System, cofactors: Array) -> tuple[NDArray[np.int64], Array]:
+    """Gains (R, U, 6) of the errors of reference poses: dx = -Q E N_pp^-1 C^-1 dX, dX = sum over rays of B e.
 
-    With the points' own covariance C; free points do not depend on references.
+    With the given positions' covariance C; free points do not depend on references.
     """
-    if not len(problem.ray_point):
-        return {}
+    used, place = np.unique(problem.ray_reference, return_inverse=True)
     pulled = system.solved @ problem.prior_information  # (P, U, 3)
     by_ray = pulled[problem.ray_point] @ problem.by_reference_pose
-    used, place = np.unique(problem.ray_reference, return_inverse=True)
-    gains = cofactors @ segment_sum(by_ray, place.ravel(), len(used))
-    return {int(index): gain for index, gain in zip(used, gains, strict=True)}
+    return used, -cofactors @ segment_sum(by_ray, place.ravel(), len(used))
 
 
 def _inverse(normal: Array) -> Array | None:
@@ -334,14 +337,3 @@ def _inverse(normal: Array) -> Array | None:
     if np.linalg.eigvalsh(scaled)[0] <= 1e-12:
         return None
     return cast(Array, np.linalg.inv(scaled)) * scale[:, None] * scale[None, :]
-
-
-def with_references(solved: SolvedStations, member: int, reference_pose_cov) -> tuple[Array, Array]:
-    """A member's pose covariance (6, 6), with the errors of the references and without."""
-    chain = solved.chain(member)
-    relative = symmetric(chain @ solved.cofactors @ chain.T)
-    shared = np.zeros((6, 6))
-    for index, gain in solved.by_reference.items():
-        own = chain @ gain
-        shared += own @ reference_pose_cov(index) @ own.T
-    return symmetric(relative + shared), relative
