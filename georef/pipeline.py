@@ -19,7 +19,7 @@ from georef.config import Config
 from georef.executor import Executor
 from georef.io.files import write_text_atomically
 from georef.project import Project
-from georef.stages import adjust, features, global_map, index, leave_one_out, localize, network, report
+from georef.stages import adjust, features, global_map, index, leave_one_out, localize, network, report, stations
 from georef.stages.base import Meter, Run, StageContext, StageSummary, feature_id
 from georef.stages.survey import Survey, load_survey
 from georef.types.campaign import Campaign
@@ -55,6 +55,10 @@ def _epoch_files(project: Project, survey: Survey) -> dict[str, Any]:
     return {"epoch tables": _digest(survey.epoch)}
 
 
+def _mountings(project: Project, survey: Survey) -> dict[str, Any]:
+    return {"mountings": _hash([[name, _plain(mounting)] for name, mounting in survey.epoch.mountings.items()])}
+
+
 def _all_images(project: Project, survey: Survey) -> dict[str, Any]:
     return {"images": _states_of(survey, survey.reference, survey.epoch)}
 
@@ -85,10 +89,16 @@ _NETWORK_KEYS = (
 
 _MAP_KEYS = ("matching", "global_map", "candidates.epochs")
 _LOCALIZE_KEYS = ("matching", "candidates", "localize")
+_STATION_KEYS = ("stations", "localize", "candidates.epochs")
+_BEFORE_ADJUST = ("features", "network", "localize", "stations")
 
 
 def _uses_index(config: Config) -> bool:
     return config.candidates.ranking != "votes"
+
+
+def _uses_stations(config: Config) -> bool:
+    return config.stations.together != "none"
 
 
 def _uses_map(config: Config) -> bool:
@@ -103,8 +113,9 @@ STAGES: tuple[Stage, ...] = (
         "global-map", 1, _MAP_KEYS, _reference_with_images, ("network",), global_map.run, _uses_map, of_reference=True
     ),
     Stage("localize", 4, _LOCALIZE_KEYS, _epoch_files, ("features", "network", "index", "global-map"), localize.run),
-    Stage("adjust", 4, ("adjust", "localize", "matching"), _control, ("features", "network", "localize"), adjust.run),
-    Stage("report", 2, ("report",), _check, ("features", "network", "localize", "adjust"), report.run),
+    Stage("stations", 1, _STATION_KEYS, _mountings, ("features", "network", "localize"), stations.run, _uses_stations),
+    Stage("adjust", 4, ("adjust", "localize", "matching"), _control, _BEFORE_ADJUST, adjust.run),
+    Stage("report", 2, ("report",), _check, (*_BEFORE_ADJUST, "adjust"), report.run),
 )
 
 
@@ -225,7 +236,7 @@ def _results_exist(context: StageContext, stage: str) -> bool:
         "global-map": context.folder / global_map.STRUCTURE,
         "adjust": context.folder / adjust.RESULT,
     }
-    checks = {"localize": localize.outcomes_exist, "report": report.outputs_exist}
+    checks = {"localize": localize.outcomes_exist, "stations": localize.outcomes_exist, "report": report.outputs_exist}
     return checks[stage](context) if stage in checks else stage not in left or left[stage].exists()
 
 

@@ -21,8 +21,8 @@ from georef.io.rig_table import read_rig
 from georef.io.tables import check_declared_crs, check_declared_height
 from georef.project import Project
 from georef.stages.cameras import CameraTable, Stated, unknown_camera, with_unknown
-from georef.stages.panoramas import CutOut, placeholder, with_heads
 from georef.stages.mountings import with_rig
+from georef.stages.panoramas import CutOut, placeholder, with_heads
 from georef.stages.reference import image_files, read_orientations, reference_campaign, table_format, world_poses
 from georef.types.campaign import Campaign, Image, PositionPrior
 from georef.types.constraints import CheckKind, CheckPoint, ControlPoint, Mark
