@@ -7,65 +7,57 @@ note: a contradiction is never averaged.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from georef.config import LocalizeConfig, StationsConfig
-from georef.estimation.guided import GuidedOptions, PosedFeatures, guided_matches
-from georef.estimation.prior_check import against_prior
 from georef.estimation.reference_map import ReferenceMap
-from georef.estimation.station_problem import Member, StationProblem, station_problem
+from georef.estimation.station_image import StationImage, outcomes_of, station_of
+from georef.estimation.station_problem import Member, station_problem
+from georef.estimation.station_search import second_chance
 from georef.estimation.station_solve import SolvedStations, solve_stations
 from georef.estimation.timer import StepTimer
 from georef.estimation.tracks import PairMatches
 from georef.geometry.rigid import Array, Rigid3
-from georef.types.campaign import Image, Mounting
-from georef.types.results import Localized, Outcome, ReferenceMatches, Rejected
+from georef.types.results import Localized, Outcome, Rejected
 
 _CONTRADICTION = 0.9999  # probability of the chi-square test of two images' stations
-_SIMILAR_VIEW_RAD = np.radians(60.0)
 
-
-@dataclass(frozen=True, eq=False)
-class StationImage:
-    """One image of a station: what it shows, how it is mounted, and what came of it alone."""
-
-    image: Image
-    features: PosedFeatures  # any pose
-    mounting: Mounting
-    outcome: Outcome
-
-    @property
-    def usable(self) -> bool:
-        """Whether it has a pose and a camera that is not the image's own to estimate."""
-        return isinstance(self.outcome, Localized) and self.outcome.camera is None
-
-    def member(self, station: int, matches: tuple[ReferenceMatches, ...] | None = None) -> Member:
-        found = self.outcome.matches if isinstance(self.outcome, Localized) else ()
-        given = found if matches is None else matches
-        return Member(self.image.image_id, station, self.mounting, self.features, given)
+FindStation = Callable[[Sequence[StationImage]], Rigid3 | None]
 
 
 def localize_station(
-    images: Sequence[StationImage], reference: ReferenceMap, config: StationsConfig, localize: LocalizeConfig
+    images: Sequence[StationImage],
+    reference: ReferenceMap,
+    config: StationsConfig,
+    localize: LocalizeConfig,
+    find: FindStation | None = None,
 ) -> list[Outcome]:
-    """The outcomes of a station's images, posed together where they fit its rig."""
+    """The outcomes of a station's images, posed together where they fit its rig.
+
+    find: looks for the station where no image was localized alone.
+    """
     cpu_s: dict[str, float] = {}
     with StepTimer(cpu_s, "station"):
-        outcomes = _together(images, reference, config, localize)
+        outcomes = _together(images, reference, config, localize, find)
     shared = cpu_s["station"] / max(len(images), 1)
     return [replace(o, cpu_s={**o.cpu_s, "station": o.cpu_s.get("station", 0.0) + shared}) for o in outcomes]
 
 
 def _together(
-    images: Sequence[StationImage], reference: ReferenceMap, config: StationsConfig, localize: LocalizeConfig
+    images: Sequence[StationImage],
+    reference: ReferenceMap,
+    config: StationsConfig,
+    localize: LocalizeConfig,
+    find: FindStation | None,
 ) -> list[Outcome]:
     alone = [s.outcome for s in images]
     agreeing, note = fitting(images)
+    if not agreeing and not note and find is not None:
+        return _found(images, reference, config, localize, find)
     if not agreeing:
         return [replace(o, notes=(*o.notes, note)) if note else o for o in alone]
     start = station_of(images[agreeing[0]])
@@ -90,10 +82,36 @@ def _together(
     return out
 
 
-def station_of(image: StationImage) -> Rigid3:
-    """world_from_rig as a localized image has it."""
-    assert isinstance(image.outcome, Localized)
-    return image.outcome.world_from_cam @ image.mounting.rig_from_cam.inverse()
+def _found(
+    images: Sequence[StationImage],
+    reference: ReferenceMap,
+    config: StationsConfig,
+    localize: LocalizeConfig,
+    find: FindStation,
+) -> list[Outcome]:
+    """The outcomes where no image was localized alone: two at least must fit, or all stay rejected."""
+    alone = [s.outcome for s in images]
+    start = find(images)
+    if start is None:
+        return alone
+    asked = [i for i, s in enumerate(images) if not s.image.camera.estimate]
+    members = [images[i].member(0, second_chance(images[i], start, reference, localize)) for i in asked]
+    for _ in range(len(asked)):
+        solved = _solved(members, start, reference, config) if len(asked) > 1 else None
+        if solved is None:
+            return alone
+        enough = [_enough(solved, k, localize) for k in range(len(asked))]
+        if all(enough):
+            break
+        members = [member for member, good in zip(members, enough, strict=True) if good]
+        asked = [i for i, good in zip(asked, enough, strict=True) if good]
+    else:
+        return alone
+    out = list(alone)
+    posed = outcomes_of(solved, reference, [images[i] for i in asked], list(range(len(asked))), localize)
+    for i, outcome in zip(asked, posed, strict=True):
+        out[i] = _noted(outcome, alone[i], len(asked), of_majority=False)
+    return out
 
 
 def fitting(images: Sequence[StationImage]) -> tuple[list[int], str]:
@@ -133,29 +151,6 @@ def _solved(
     return solve_stations(problem, config.gate_probability) if len(problem.given) else None
 
 
-def second_chance(
-    image: StationImage, world_from_rig: Rigid3, reference: ReferenceMap, config: LocalizeConfig, count: int = 10
-) -> tuple[ReferenceMatches, ...]:
-    """Matches along the epipolar lines of the pose that the station gives an image, with the nearest references."""
-    pose = world_from_rig @ image.mounting.rig_from_cam
-    options = GuidedOptions(config.guided_gate, config.guided_min_similarity, config.guided_ratio)
-    found = []
-    for index in _references_near(pose, reference, count):
-        matches = guided_matches(image.features.posed(pose), reference.posed(index), options)
-        if len(matches):
-            found.append(ReferenceMatches(reference.images[index].image_id, matches.indices))
-    return tuple(found)
-
-
-def _references_near(pose: Rigid3, reference: ReferenceMap, count: int) -> list[int]:
-    """The nearest references that look in a similar direction."""
-    axes = np.array([p.rotation[:, 2] for p in reference.poses])
-    similar = axes @ pose.rotation[:, 2] >= np.cos(_SIMILAR_VIEW_RAD)
-    distance = np.linalg.norm(reference.positions - pose.translation, axis=1)
-    order = np.argsort(np.where(similar, distance, np.inf), kind="stable")
-    return [int(i) for i in order[:count] if similar[i]]
-
-
 def _joined(
     members: list[Member],
     asked: list[int],
@@ -183,58 +178,6 @@ def _enough(solved: SolvedStations, member: int, config: LocalizeConfig) -> bool
     own = (solved.problem.observations.view == member) & ~solved.problem.free[solved.problem.observations.point]
     inliers = int((own & solved.inliers).sum())
     return inliers >= config.min_inliers and inliers >= config.min_inlier_ratio * int(own.sum())
-
-
-def outcomes_of(
-    solved: SolvedStations,
-    reference: ReferenceMap,
-    images: Sequence[StationImage],
-    members: Sequence[int],
-    localize: LocalizeConfig,
-) -> list[Outcome]:
-    """Outcomes of some members of a solved problem (the images are theirs), each with its share of the matches."""
-    poses, (covs, relative) = solved.poses(), solved.covs(reference)
-    out = []
-    for image, member in zip(images, members, strict=True):
-        points, keypoints, matches = _evidence(solved, member, reference)
-        outcome = Localized(
-            image_id=image.image.image_id,
-            world_from_cam=poses[member],
-            world_from_cam_cov=covs[member],
-            relative_cov=relative[member],
-            correspondence_count=len(points),
-            sigma0=solved.sigma0,
-            matches=matches,
-            points_in_world=points,
-            keypoints=keypoints,
-            notes=image.outcome.notes,
-            cpu_s=image.outcome.cpu_s,
-            candidates=image.outcome.candidates,
-        )
-        out.append(against_prior(outcome, image.image, localize))
-    return out
-
-
-def _evidence(
-    solved: SolvedStations, member: int, reference: ReferenceMap
-) -> tuple[Array, NDArray[np.int64], tuple[ReferenceMatches, ...]]:
-    """The points with positions that a member sees, its keypoints, and its matches with the references behind them."""
-    problem: StationProblem = solved.problem
-    obs = problem.observations
-    own = solved.inliers & (obs.view == member) & ~problem.free[obs.point]
-    point_of = np.full(len(problem.members[member].features.features), -1, np.int64)
-    point_of[obs.keypoint[own]] = obs.point[own]
-    index = {image.image_id: i for i, image in enumerate(reference.images)}
-    matches = []
-    for found in problem.members[member].matches:
-        place = index[found.reference_id]
-        rays = problem.ray_reference == place
-        behind = np.full(len(reference.posed(place).features), -2, np.int64)
-        behind[problem.ray_keypoint[rays]] = problem.ray_point[rays]
-        same = point_of[found.indices[:, 0]] == behind[found.indices[:, 1]]
-        if same.any():
-            matches.append(ReferenceMatches(found.reference_id, found.indices[same]))
-    return problem.given[obs.point[own]], obs.keypoint[own], tuple(matches)
 
 
 def _noted(outcome: Outcome, before: Outcome, count: int, *, of_majority: bool) -> Outcome:

@@ -9,9 +9,10 @@ import pytest
 from scipy.stats import chi2
 
 from georef.config import StationsConfig
+from georef.estimation.station_image import StationImage, station_of
 from georef.estimation.station_problem import station_problem
 from georef.estimation.station_solve import solve_stations
-from georef.estimation.stations import StationImage, localize_station, localize_window, station_of
+from georef.estimation.stations import localize_station, localize_window
 from georef.estimation.tracks import PairMatches
 from georef.types.results import Localized, Outcome, Rejected
 from tests.worlds.points import common, pose_nees

@@ -12,7 +12,7 @@ from georef.estimation.first_pose import QueryImage
 from georef.estimation.local_model import query_centred_model
 from georef.estimation.pnp import refine_pose
 from georef.estimation.reference_map import ReferenceMap
-from georef.estimation.stations import StationImage
+from georef.estimation.station_image import StationImage
 from georef.geometry.rigid import Array, Rigid3, exp_so3
 from georef.types.campaign import Mounting
 from georef.types.results import Localized, ReferenceMatches, Rejected, RejectReason
