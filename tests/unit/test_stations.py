@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -11,15 +12,18 @@ from scipy.stats import chi2
 from georef.config import StationsConfig
 from georef.estimation.station_image import StationImage, station_of
 from georef.estimation.station_problem import station_problem
+from georef.estimation.station_search import first_station_pose
 from georef.estimation.station_solve import solve_stations
 from georef.estimation.stations import localize_station, localize_window
 from georef.estimation.tracks import PairMatches
+from georef.features.nearest import MutualNearest
+from georef.geometry.rigid import Rigid3
 from georef.types.results import Localized, Outcome, Rejected
 from tests.worlds.points import common, pose_nees
 from tests.worlds.rig import LOCALIZE, RigSurvey, moved, rejected, rig_survey
 
 CONFIG = StationsConfig()
-_RUNS = 60
+_RUNS = 24
 
 
 def station(survey: RigSurvey, images: list[StationImage] | None = None) -> list[Outcome]:
@@ -164,3 +168,22 @@ def test_free_tie_points_take_part_where_three_rays_see_them() -> None:
     assert alone is not None
     covs, covs_alone = solved.covs(survey.reference)[1], alone.covs(survey.reference)[1]
     assert all(np.trace(a[3:, 3:]) < np.trace(b[3:, 3:]) for a, b in zip(covs, covs_alone, strict=True))
+
+
+def test_a_station_of_rejected_images_is_found_by_all_of_them_together() -> None:
+    survey = rig_survey(10)
+    images = [
+        replace(i, outcome=replace(i.outcome, candidates=tuple(f"r{k}" for k in range(6))))
+        for i in map(rejected, survey.exposures[0].images)
+    ]
+
+    def find(asked: Sequence[StationImage]) -> Rigid3 | None:
+        return first_station_pose(asked, survey.reference, MutualNearest(ratio=0.9), 2000, 4, LOCALIZE)
+
+    outcomes = localize_station(images, survey.reference, CONFIG, LOCALIZE, find)
+    for k, outcome in enumerate(map(localized, outcomes)):
+        assert error_mm(survey, outcome, k) < 30
+        assert "alone it was rejected: few_matches (as a test)" in outcome.notes
+    turned = [replace(i.mounting, rig_from_cam=i.mounting.rig_from_cam.inverse()) for i in images]
+    scattered = [replace(i, mounting=mounting) for i, mounting in zip(images, turned, strict=True)]
+    assert all(isinstance(o, Rejected) for o in localize_station(scattered, survey.reference, CONFIG, LOCALIZE, find))

@@ -48,7 +48,7 @@ def rig_survey(
     *,
     cameras: int = 2,
     exposures: int = 1,
-    points: int = 260,
+    points: int = 170,
     references: int = 6,
     calibrated: Array | None = RIG_SIGMAS,
 ) -> RigSurvey:
