@@ -39,6 +39,7 @@ class Stage:
     needs: tuple[str, ...]  # stages before it, where they are wanted
     run: Run
     wanted: Callable[[Config], bool] = lambda config: True
+    applies: Callable[[Config, Survey], bool] = lambda config, survey: True  # to what the epoch holds
     of_reference: bool = False  # looks at the reference alone: done once for all epochs
     results_exist: Callable[[StageContext], bool] | None = None  # where it is not known of the stage's name
 
@@ -97,8 +98,9 @@ def _uses_index(config: Config) -> bool:
     return config.candidates.ranking != "votes"
 
 
-def _uses_stations(config: Config) -> bool:
-    return config.stations.together != "none"
+def _has_stations(config: Config, survey: Survey) -> bool:
+    together = config.stations.together
+    return together == "sequence" or (together == "station" and bool(survey.epoch.mountings))
 
 
 def _uses_map(config: Config) -> bool:
@@ -175,7 +177,7 @@ def _plan(
     prints: dict[str, str] = {}
     version = features.extractor_version(project.config.features)
     before = {"store": project.feature_folder / _hash(version)[:12]}
-    for stage in (stage for stage in stages if stage.wanted(project.config)):
+    for stage in (s for s in stages if s.wanted(project.config) and s.applies(project.config, survey)):
         parts = {
             "stage version": stage.version,
             "components": _components(stage, project.config),

@@ -41,22 +41,25 @@ def run(context: StageContext) -> StageSummary:
     task = StationTask(make_task(context), dict(epoch.mountings), alone)
     groups, last = groups_of(epoch), context.folder / ITEMS
     first = context.folder / EXPOSURES if config.together == "sequence" else last
-    _store(context, task, groups, first, "stations")
+    computed = _store(context, task, groups, first)
     if config.together == "sequence":
         task.outcomes = {o.image_id: o for o in read_outcomes(context.folder, epoch, EXPOSURES)}
         windows = windows_of(groups, task.outcomes, config.length, config.max_gap_m)
         pending = [w for w in windows if not _all_there(last, w[0][w[1]])]
+        computed = sum(len(w[0][w[1]]) for w in pending)
         pairs = neighbouring_pairs(task, pending, config.tie_neighbours)
         task.ties = dict(context.executor.map_items(TieTask(task), pairs, "tie points"))
         for outcomes in context.executor.map_items(WindowTask(task), pending, "sequences"):
             _write(last, outcomes)
-    return _summary(alone, read_outcomes(context.folder, epoch), groups)
+    return _summary(alone, read_outcomes(context.folder, epoch), groups, computed)
 
 
-def _store(context: StageContext, task: StationTask, groups: list[list[Image]], folder: Path, label: str) -> None:
+def _store(context: StageContext, task: StationTask, groups: list[list[Image]], folder: Path) -> int:
+    """Poses the exposures that are not stored yet; the number of their images."""
     pending = [group for group in groups if not _all_there(folder, group)]
-    for outcomes in context.executor.map_items(task, pending, label):
+    for outcomes in context.executor.map_items(task, pending, "stations"):
         _write(folder, outcomes)
+    return sum(map(len, pending))
 
 
 def _all_there(folder: Path, group: Sequence[Image]) -> bool:
@@ -104,7 +107,9 @@ def neighbouring_pairs(task: StationTask, windows: Sequence[Window], neighbours:
     return list(chosen.values())
 
 
-def _summary(alone: dict[str, Outcome], outcomes: list[Outcome], groups: list[list[Image]]) -> StageSummary:
+def _summary(
+    alone: dict[str, Outcome], outcomes: list[Outcome], groups: list[list[Image]], computed: int
+) -> StageSummary:
     stations = sum(len(group) > 1 for group in groups)
     changed = [o for o in outcomes if isinstance(o, Localized) and o.notes != alone[o.image_id].notes]
     rescued = [o for o in changed if not isinstance(alone[o.image_id], Localized)]
@@ -112,4 +117,4 @@ def _summary(alone: dict[str, Outcome], outcomes: list[Outcome], groups: list[li
     if rescued:
         line += f", {len(rescued)} of images that were rejected alone"
     data = {"stations": stations, "posed": len(changed), "rescued": [o.image_id for o in rescued]}
-    return StageSummary(line, data, len(outcomes), len(outcomes))
+    return StageSummary(line, data, computed, len(outcomes))
