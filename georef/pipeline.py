@@ -91,7 +91,8 @@ _NETWORK_KEYS = (
 _MAP_KEYS = ("matching", "global_map", "candidates.epochs")
 _LOCALIZE_KEYS = ("matching", "candidates", "localize")
 _STATION_KEYS = ("stations", "localize", "candidates.epochs")
-_BEFORE_ADJUST = ("features", "network", "localize", "stations")
+_BEFORE_STATIONS = ("features", "network", "localize")
+_BEFORE_ADJUST = (*_BEFORE_STATIONS, "stations")
 
 
 def _uses_index(config: Config) -> bool:
@@ -115,7 +116,7 @@ STAGES: tuple[Stage, ...] = (
         "global-map", 1, _MAP_KEYS, _reference_with_images, ("network",), global_map.run, _uses_map, of_reference=True
     ),
     Stage("localize", 4, _LOCALIZE_KEYS, _epoch_files, ("features", "network", "index", "global-map"), localize.run),
-    Stage("stations", 1, _STATION_KEYS, _mountings, ("features", "network", "localize"), stations.run, _uses_stations),
+    Stage("stations", 1, _STATION_KEYS, _mountings, _BEFORE_STATIONS, stations.run, applies=_has_stations),
     Stage("adjust", 4, ("adjust", "localize", "matching"), _control, _BEFORE_ADJUST, adjust.run),
     Stage("report", 2, ("report",), _check, (*_BEFORE_ADJUST, "adjust"), report.run),
 )
