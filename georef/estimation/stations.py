@@ -77,7 +77,7 @@ def _together(
     out = list(alone)
     for i, outcome in zip(asked, posed, strict=True):
         out[i] = _noted(outcome, images[i].outcome, len(asked), of_majority=i in agreeing)
-    for i in set(range(len(images))) - set(asked):
+    for i in set(tried) - set(asked):
         out[i] = replace(alone[i], notes=(*alone[i].notes, _left_alone(images[i], solved)))
     return out
 

@@ -21,6 +21,7 @@ from georef.stages.localize import LocalizeTask
 from georef.types.campaign import Image, Mounting
 from georef.types.results import Localized, Outcome
 
+_KEPT_IMAGES = 64
 Pair = tuple[str, str]
 Window = tuple[list[list[Image]], int]
 """The exposures of a sequence, and which of them takes its pose from it."""
@@ -65,16 +66,18 @@ class StationTask:
             return [replace(o, notes=(*o.notes, f"not posed together: {detail}")) for o in before]
 
     @cached_property
-    def _bearings(self) -> dict[str, PosedFeatures]:
+    def _kept(self) -> dict[str, PosedFeatures]:
         return {}
 
     def station_image(self, image: Image) -> StationImage:
         """An image with its features and its mounting; one that is a station by itself is its own rig."""
-        known = self._bearings.get(image.image_id)
+        known = self._kept.get(image.image_id)
         if known is None:
             features = open_features(self.localize.store_folder).read(feature_id(image))
             known = PosedFeatures.of(features, image.camera, Rigid3.identity())
-            self._bearings[image.image_id] = known
+            self._kept[image.image_id] = known
+            if len(self._kept) > _KEPT_IMAGES:
+                self._kept.pop(next(iter(self._kept)))
         mounting = self.mountings.get(image.image_id, Mounting("its own", Rigid3.identity()))
         return StationImage(image, known, mounting, self.outcomes[image.image_id])
 
@@ -84,7 +87,7 @@ class StationTask:
         return self.station_image(image).features.posed(outcome.world_from_cam)
 
     def __getstate__(self) -> dict[str, object]:
-        return {key: value for key, value in self.__dict__.items() if key != "_bearings"}
+        return {key: value for key, value in self.__dict__.items() if key != "_kept"}
 
 
 @dataclass

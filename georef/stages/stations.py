@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from georef.estimation.epoch_problem import tie_pairs
+from georef.estimation.candidates import overlap
+from georef.geometry.projection import Views
 from georef.io.items import item_ids, item_path, write_outcome
 from georef.stages.base import StageContext, StageSummary
 from georef.stages.localize import ITEMS, make_task, read_outcomes
@@ -47,7 +48,7 @@ def run(context: StageContext) -> StageSummary:
         windows = windows_of(groups, task.outcomes, config.length, config.max_gap_m)
         pending = [w for w in windows if not _all_there(last, w[0][w[1]])]
         computed = sum(len(w[0][w[1]]) for w in pending)
-        pairs = neighbouring_pairs(task, pending, config.tie_neighbours)
+        pairs = neighbouring_pairs(pending, task.outcomes, config.tie_neighbours)
         task.ties = dict(context.executor.map_items(TieTask(task), pairs, "tie points"))
         for outcomes in context.executor.map_items(WindowTask(task), pending, "sequences"):
             _write(last, outcomes)
@@ -96,15 +97,34 @@ def _position(group: Sequence[Image], outcomes: dict[str, Outcome]) -> NDArray[n
     return next((o.world_from_cam.translation for o in found if isinstance(o, Localized)), None)
 
 
-def neighbouring_pairs(task: StationTask, windows: Sequence[Window], neighbours: int) -> list[tuple[Image, Image]]:
-    """Pairs of images of one window, each image with those that see most of its points."""
+def neighbouring_pairs(
+    windows: Sequence[Window], outcomes: dict[str, Outcome], neighbours: int
+) -> list[tuple[Image, Image]]:
+    """Pairs of images of one window, each image with those that see most of the points that it was localized from."""
     chosen: dict[Pair, tuple[Image, Image]] = {}
     for groups, _ in windows if neighbours else ():
-        images = [image for group in groups for image in group if task.station_image(image).usable]
-        localized = [o for o in (task.outcomes[i.image_id] for i in images) if isinstance(o, Localized)]
-        for i, j in tie_pairs([task.posed(image) for image in images], localized, neighbours):
-            chosen[images[i].image_id, images[j].image_id] = (images[i], images[j])
+        images = [image for group in groups for image in group if not image.camera.estimate]
+        found = [(i, o) for i in images if isinstance(o := outcomes[i.image_id], Localized)]
+        shared = _shared_points(found)
+        for i, (image, _outcome) in enumerate(found):
+            for j in np.argsort(-shared[i], kind="stable")[:neighbours]:
+                a, b = (image, found[j][0]) if i < j else (found[j][0], image)
+                if shared[i, j] > 0:
+                    chosen[a.image_id, b.image_id] = (a, b)
     return list(chosen.values())
+
+
+def _shared_points(found: Sequence[tuple[Image, Localized]]) -> NDArray[np.int64]:
+    """How many of the points of each of M images each other one can see, or the other way round (M, M)."""
+    views = Views.of([o.world_from_cam for _, o in found], [image.camera for image, _ in found])
+    sizes = np.array([[image.camera.width, image.camera.height] for image, _ in found], dtype=float)
+    seen = np.zeros((len(found), len(found)), np.int64)
+    for i, (_, outcome) in enumerate(found):
+        directions = outcome.points_in_world - outcome.world_from_cam.translation
+        directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+        seen[i] = overlap(outcome.points_in_world, directions, views, sizes)
+        seen[i, i] = 0
+    return np.maximum(seen, seen.T)
 
 
 def _summary(
