@@ -44,9 +44,11 @@ def run(context: StageContext) -> StageSummary:
     first = context.folder / EXPOSURES if config.together == "sequence" else last
     computed = _store(context, task, groups, first)
     if config.together == "sequence":
-        task.outcomes = {o.image_id: o for o in read_outcomes(context.folder, epoch, EXPOSURES)}
+        together = {o.image_id: o for o in read_outcomes(context.folder, epoch, EXPOSURES)}
+        task = StationTask(make_task(context), dict(epoch.mountings), together)  # a fresh one travels to processes
         windows = windows_of(groups, task.outcomes, config.length, config.max_gap_m)
-        pending = [w for w in windows if not _all_there(last, w[0][w[1]])]
+        done = item_ids(last)
+        pending = [w for w in windows if not _all_there(done, w[0][w[1]])]
         computed = sum(len(w[0][w[1]]) for w in pending)
         pairs = neighbouring_pairs(pending, task.outcomes, config.tie_neighbours)
         task.ties = dict(context.executor.map_items(TieTask(task), pairs, "tie points"))
@@ -57,14 +59,14 @@ def run(context: StageContext) -> StageSummary:
 
 def _store(context: StageContext, task: StationTask, groups: list[list[Image]], folder: Path) -> int:
     """Poses the exposures that are not stored yet; the number of their images."""
-    pending = [group for group in groups if not _all_there(folder, group)]
+    done = item_ids(folder)
+    pending = [group for group in groups if not _all_there(done, group)]
     for outcomes in context.executor.map_items(task, pending, "stations"):
         _write(folder, outcomes)
     return sum(map(len, pending))
 
 
-def _all_there(folder: Path, group: Sequence[Image]) -> bool:
-    done = item_ids(folder)
+def _all_there(done: set[str], group: Sequence[Image]) -> bool:
     return all(image.image_id in done for image in group)
 
 
