@@ -100,8 +100,9 @@ def _uses_index(config: Config) -> bool:
 
 
 def _has_stations(config: Config, survey: Survey) -> bool:
-    together = config.stations.together
-    return together == "sequence" or (together == "station" and bool(survey.epoch.mountings))
+    return config.stations.together == "sequence" or (
+        config.stations.together == "station" and bool(survey.epoch.mountings)
+    )
 
 
 def _uses_map(config: Config) -> bool:

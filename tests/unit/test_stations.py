@@ -10,6 +10,7 @@ import pytest
 from scipy.stats import chi2
 
 from georef.config import StationsConfig
+from georef.estimation.guided import PosedFeatures
 from georef.estimation.station_image import StationImage, station_of
 from georef.estimation.station_problem import station_problem
 from georef.estimation.station_search import first_station_pose
@@ -20,7 +21,7 @@ from georef.features.nearest import MutualNearest
 from georef.geometry.rigid import Rigid3
 from georef.types.results import Localized, Outcome, Rejected
 from tests.worlds.points import common, pose_nees
-from tests.worlds.rig import LOCALIZE, RigSurvey, moved, rejected, rig_survey
+from tests.worlds.rig import LOCALIZE, RIG_SIGMAS, RigSurvey, moved, rejected, rig_survey
 
 CONFIG = StationsConfig()
 _RUNS = 24
@@ -66,7 +67,7 @@ def test_a_station_of_one_image_is_that_image() -> None:
 def test_a_station_is_better_than_its_images_and_its_covariance_holds(calibrated: bool) -> None:
     single, together, ratios = [], [], []
     for seed in range(_RUNS):
-        survey = rig_survey(100 + seed, **({} if calibrated else {"calibrated": None}))
+        survey = rig_survey(100 + seed, calibrated=RIG_SIGMAS if calibrated else None)
         for k, outcome in enumerate(map(localized, station(survey))):
             before = localized(survey.exposures[0].images[k].outcome)
             single.append(error_mm(survey, before, k))
@@ -93,9 +94,9 @@ def test_an_image_that_was_rejected_alone_joins_its_station() -> None:
 def test_an_image_of_another_place_does_not_join() -> None:
     survey, other = rig_survey(3), rig_survey(4)
     first, second = survey.exposures[0].images
-    clutter = other.exposures[0].images[1].features.features
-    shuffled = replace(clutter, descriptors=clutter.descriptors[::-1].copy())
-    foreign = rejected(replace(second, features=replace(second.features, features=shuffled)))
+    seen = other.exposures[0].seen[1]
+    shuffled = replace(seen.features, descriptors=seen.features.descriptors[::-1].copy())
+    foreign = rejected(replace(second, features=PosedFeatures.of(shuffled, seen.camera, Rigid3.identity())))
     before, after = first.outcome, station(survey, [first, foreign])
     assert isinstance(after[1], Rejected)
     assert same_pose(after[0], before)
@@ -171,7 +172,7 @@ def test_free_tie_points_take_part_where_three_rays_see_them() -> None:
 
 
 def test_a_station_of_rejected_images_is_found_by_all_of_them_together() -> None:
-    survey = rig_survey(10)
+    survey = rig_survey(10, points=400)
     images = [
         replace(i, outcome=replace(i.outcome, candidates=tuple(f"r{k}" for k in range(6))))
         for i in map(rejected, survey.exposures[0].images)
