@@ -99,12 +99,6 @@ def _uses_index(config: Config) -> bool:
     return config.candidates.ranking != "votes"
 
 
-def _has_stations(config: Config, survey: Survey) -> bool:
-    return config.stations.together == "sequence" or (
-        config.stations.together == "station" and bool(survey.epoch.mountings)
-    )
-
-
 def _uses_map(config: Config) -> bool:
     return config.localize.method == "global-model"
 
@@ -117,7 +111,7 @@ STAGES: tuple[Stage, ...] = (
         "global-map", 1, _MAP_KEYS, _reference_with_images, ("network",), global_map.run, _uses_map, of_reference=True
     ),
     Stage("localize", 4, _LOCALIZE_KEYS, _epoch_files, ("features", "network", "index", "global-map"), localize.run),
-    Stage("stations", 1, _STATION_KEYS, _mountings, _BEFORE_STATIONS, stations.run, applies=_has_stations),
+    Stage("stations", 1, _STATION_KEYS, _mountings, _BEFORE_STATIONS, stations.run, applies=stations.wanted),
     Stage("adjust", 4, ("adjust", "localize", "matching"), _control, _BEFORE_ADJUST, adjust.run),
     Stage("report", 2, ("report",), _check, (*_BEFORE_ADJUST, "adjust"), report.run),
 )

@@ -8,16 +8,24 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from georef.config import Config
 from georef.estimation.candidates import overlap
 from georef.geometry.projection import Views
 from georef.io.items import item_ids, item_path, write_outcome
 from georef.stages.base import StageContext, StageSummary
 from georef.stages.localize import ITEMS, make_task, read_outcomes
 from georef.stages.station_tasks import Pair, StationTask, TieTask, Window, WindowTask
+from georef.stages.survey import Survey
 from georef.types.campaign import Campaign, Image
 from georef.types.results import Localized, Outcome
 
 EXPOSURES = "exposures"
+
+
+def wanted(config: Config, survey: Survey) -> bool:
+    """Whether anything of an epoch belongs together: else its images stay as they were localized."""
+    together = config.stations.together
+    return together == "sequence" or (together == "station" and bool(survey.epoch.mountings))
 
 
 def final_outcomes(context: StageContext) -> list[Outcome]:
