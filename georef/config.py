@@ -100,6 +100,16 @@ class NetworkConfig(Section):
     max_suspect_share: float = Field(default=0.1, ge=0, le=0.5)
 
 
+class StationsConfig(Section):
+    together: Literal["none", "station", "sequence"] = "station"
+    length: int = Field(default=3, ge=2)
+    max_gap_m: float = Field(default=15.0, gt=0)
+    tie_neighbours: int = Field(default=4, ge=0)
+    min_tie_point_rays: int = Field(default=3, ge=3)
+    max_tie_points_per_image: int = Field(default=100, ge=20)
+    gate_probability: float = Field(default=0.999, gt=0.5, lt=1)
+
+
 class AdjustConfig(Section):
     constraints: Literal["auto-gcps", "pose-priors", "none"] = "auto-gcps"
     tie_points: bool = True
@@ -143,6 +153,7 @@ class Config(Section):
     localize: LocalizeConfig = LocalizeConfig()
     network: NetworkConfig = NetworkConfig()
     global_map: GlobalMapConfig = GlobalMapConfig()
+    stations: StationsConfig = StationsConfig()
     adjust: AdjustConfig = AdjustConfig()
     report: ReportConfig = ReportConfig()
     run: RunConfig = RunConfig()

@@ -6,7 +6,6 @@ stages before it. Same fingerprint: done work is kept. Different: a new folder; 
 
 from __future__ import annotations
 
-import hashlib
 import json
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -19,10 +18,19 @@ from georef.config import Config
 from georef.executor import Executor
 from georef.io.files import write_text_atomically
 from georef.project import Project
-from georef.stages import adjust, features, global_map, index, leave_one_out, localize, network, report
-from georef.stages.base import Meter, Run, StageContext, StageSummary, feature_id
+from georef.stages import adjust, features, global_map, index, leave_one_out, localize, network, report, stations
+from georef.stages.base import Meter, Run, StageContext, StageSummary
+from georef.stages.fingerprints import (
+    all_images,
+    check,
+    control,
+    digest_of,
+    epoch_files,
+    mountings,
+    reference_with_images,
+    setting,
+)
 from georef.stages.survey import Survey, load_survey
-from georef.types.campaign import Campaign
 
 DONE = "stage.json"
 BEGUN = "fingerprint.json"
@@ -39,38 +47,9 @@ class Stage:
     needs: tuple[str, ...]  # stages before it, where they are wanted
     run: Run
     wanted: Callable[[Config], bool] = lambda config: True
+    applies: Callable[[Config, Survey], bool] = lambda config, survey: True  # to what the epoch holds
     of_reference: bool = False  # looks at the reference alone: done once for all epochs
     results_exist: Callable[[StageContext], bool] | None = None  # where it is not known of the stage's name
-
-
-def _reference_files(project: Project, survey: Survey) -> dict[str, Any]:
-    return {
-        "crs": project.file.crs.model_dump(),
-        "reference": {name: section.model_dump() for name, section in project.file.reference_epochs.items()},
-        "reference tables": _digest(survey.reference),
-    }
-
-
-def _epoch_files(project: Project, survey: Survey) -> dict[str, Any]:
-    return {"epoch tables": _digest(survey.epoch)}
-
-
-def _all_images(project: Project, survey: Survey) -> dict[str, Any]:
-    return {"images": _states_of(survey, survey.reference, survey.epoch)}
-
-
-def reference_with_images(project: Project, survey: Survey) -> dict[str, Any]:
-    features_version = features.extractor_version(project.config.features)
-    reference = {"features": features_version, "images": _states_of(survey, survey.reference)}
-    return {**_reference_files(project, survey), **reference}
-
-
-def _control(project: Project, survey: Survey) -> dict[str, Any]:
-    return {"control points": _hash([_plain(p) for p in survey.control])}
-
-
-def _check(project: Project, survey: Survey) -> dict[str, Any]:
-    return {"check points": _hash([_plain(p) for p in survey.check]), **_reference_files(project, survey)}
 
 
 _NETWORK_KEYS = (
@@ -85,6 +64,9 @@ _NETWORK_KEYS = (
 
 _MAP_KEYS = ("matching", "global_map", "candidates.epochs")
 LOCALIZE_KEYS = ("matching", "candidates", "localize")
+_STATION_KEYS = ("stations", "localize", "candidates.epochs")
+_BEFORE_STATIONS = ("features", "network", "localize")
+_BEFORE_ADJUST = (*_BEFORE_STATIONS, "stations")
 
 
 def _uses_index(config: Config) -> bool:
@@ -96,15 +78,16 @@ def _uses_map(config: Config) -> bool:
 
 
 STAGES: tuple[Stage, ...] = (
-    Stage("features", 2, ("features",), _all_images, (), features.run),
+    Stage("features", 2, ("features",), all_images, (), features.run),
     Stage("network", 4, _NETWORK_KEYS, reference_with_images, (), network.run, of_reference=True),
     Stage("index", 1, ("retrieval",), reference_with_images, (), index.run, _uses_index, of_reference=True),
     Stage(
         "global-map", 1, _MAP_KEYS, reference_with_images, ("network",), global_map.run, _uses_map, of_reference=True
     ),
-    Stage("localize", 5, LOCALIZE_KEYS, _epoch_files, ("features", "network", "index", "global-map"), localize.run),
-    Stage("adjust", 5, ("adjust", "localize", "matching"), _control, ("features", "network", "localize"), adjust.run),
-    Stage("report", 2, ("report",), _check, ("features", "network", "localize", "adjust"), report.run),
+    Stage("localize", 5, LOCALIZE_KEYS, epoch_files, ("features", "network", "index", "global-map"), localize.run),
+    Stage("stations", 1, _STATION_KEYS, mountings, _BEFORE_STATIONS, stations.run, applies=stations.wanted),
+    Stage("adjust", 6, ("adjust", "localize", "matching"), control, _BEFORE_ADJUST, adjust.run),
+    Stage("report", 2, ("report",), check, (*_BEFORE_ADJUST, "adjust"), report.run),
 )
 
 
@@ -155,16 +138,16 @@ def _plan(
     """Each stage with its folder, the parts of its fingerprint, and the folders of the stages before it."""
     prints: dict[str, str] = {}
     version = features.extractor_version(project.config.features)
-    before = {"store": project.feature_folder / _hash(version)[:12]}
-    for stage in (stage for stage in stages if stage.wanted(project.config)):
+    before = {"store": project.feature_folder / digest_of(version)[:12]}
+    for stage in (s for s in stages if s.wanted(project.config) and s.applies(project.config, survey)):
         parts = {
             "stage version": stage.version,
             "components": _components(stage, project.config),
-            **{f"[{name}]": _setting(project.config, name) for name in stage.sections},
+            **{f"[{name}]": setting(project.config, name) for name in stage.sections},
             **stage.reads(project, survey),
             **{f"stage {name}": prints[name] for name in stage.needs if name in prints},
         }
-        prints[stage.name] = _hash(parts)[:12]
+        prints[stage.name] = digest_of(parts)[:12]
         folder = project.stage_folder(_scope(stage, epoch), stage.name, prints[stage.name])
         yield stage, folder, parts, dict(before)
         before[stage.name] = folder
@@ -217,7 +200,7 @@ def _results_exist(context: StageContext, stage: str) -> bool:
         "global-map": context.folder / global_map.STRUCTURE,
         "adjust": context.folder / adjust.RESULT,
     }
-    checks = {"localize": localize.outcomes_exist, "report": report.outputs_exist}
+    checks = {"localize": localize.outcomes_exist, "stations": localize.outcomes_exist, "report": report.outputs_exist}
     return checks[stage](context) if stage in checks else stage not in left or left[stage].exists()
 
 
@@ -236,60 +219,6 @@ def _state_of(project: Project, epoch: str, stage: Stage, folder: Path, parts: d
     now = json.loads(json.dumps(parts))  # as it is stored: a tuple is a list there
     changed = [key for key in {**before, **now} if before.get(key) != now.get(key)]
     return StageState(stage.name, "stale", f"changed: {', '.join(changed)}", folder)
-
-
-def _setting(config: Config, name: str) -> Any:
-    """A section of the configuration as plain values, or one key of it."""
-    section, _, key = name.partition(".")
-    values = getattr(config, section).model_dump()
-    return values[key] if key else values
-
-
-def _digest(campaign: Campaign) -> str:
-    """A hash of all that the tables say of the images of a campaign."""
-    return _hash([_plain(image) for image in campaign.images])
-
-
-def _plain(value: Any) -> Any:
-    """A value as JSON: dataclasses as their fields, arrays as lists, paths by their name."""
-    if hasattr(value, "__dataclass_fields__"):
-        return {name: _plain(getattr(value, name)) for name in value.__dataclass_fields__}
-    if hasattr(value, "tolist"):
-        return value.tolist()
-    if isinstance(value, Path):
-        return value.name
-    if isinstance(value, (tuple, list)):
-        return [_plain(v) for v in value]
-    return value
-
-
-def _states_of(survey: Survey, *campaigns: Campaign) -> str:
-    """A hash of what decides the features of images: their files, how they are cut, their keys and sizes."""
-    return _hash(
-        [
-            [
-                feature_id(image),
-                image.path.name,
-                image.camera.width,
-                image.camera.height,
-                _state(survey.source_of(image)),
-            ]
-            for campaign in campaigns
-            for image in campaign.images
-        ]
-    )
-
-
-def _state(path: Path) -> list[Any]:
-    try:
-        status = path.stat()
-    except OSError:
-        return [path.name, None, None]
-    return [path.name, status.st_size, status.st_mtime_ns]
-
-
-def _hash(value: Any) -> str:
-    return hashlib.sha256(json.dumps(value, sort_keys=True, default=str).encode()).hexdigest()
 
 
 def _read_json(path: Path) -> dict[str, Any] | None:

@@ -80,7 +80,9 @@ class ReferenceSection(Section):
 
 
 class EpochSection(Section):
-    """intrinsics: what is not known of the cameras; "estimate" is the focal length, the principal point and k1.
+    """rig: a table of how cameras are mounted; images of one `station` in the table of positions were taken together.
+
+    intrinsics: what is not known of the cameras; "estimate" is the focal length, the principal point and k1.
 
     A principal point that is held where it is not makes poses wrong by more than they state.
     """
@@ -88,6 +90,7 @@ class EpochSection(Section):
     images: str
     cameras: str | None = None
     gnss: str | None = None
+    rig: str | None = None
     intrinsics: str | tuple[str, ...] | None = None
     panorama: PanoramaSection | None = None
     table: TableSection = TableSection()
@@ -95,6 +98,11 @@ class EpochSection(Section):
     @model_validator(mode="after")
     def _one_source_of_cameras(self) -> EpochSection:
         _refuse_cameras_of_panoramas(self.cameras, self.panorama)
+        if self.rig is not None and (self.panorama is not None or self.gnss is None):
+            raise ValueError(
+                "a rig needs the column `station` of a table of positions (gnss), which says what was exposed "
+                "together; the heads of a panorama are a rig by themselves: leave out rig"
+            )
         if self.panorama is not None and self.intrinsics is not None:
             raise ValueError("the heads of a panorama are known cameras: leave out intrinsics")
         if self.cameras is None and self.panorama is None and "focal" not in self.unknown:

@@ -18,13 +18,15 @@ class GnssTable(PositionTable):
     """Measured positions of N images: see PositionTable, and
 
     heading_deg: of the optical axis, clockwise from north, NaN where it is empty or the file has no such column;
-    cameras: the id of each image's camera, empty where none is named.
+    cameras: the id of each image's camera, empty where none is named;
+    stations: the exposure that each image belongs to with other cameras of its rig, empty where it was taken alone.
     """
 
     image_ids: tuple[str, ...]
     sigmas_m: Array  # (N, 3) m along the axes of the CRS (geographic: east, north, up), NaN where none is stated
     heading_deg: Array  # (N,)
     cameras: tuple[str, ...]
+    stations: tuple[str, ...]
 
     @property
     def unstated(self) -> bool:
@@ -39,7 +41,7 @@ def read_gnss(
     columns: Mapping[str, str] | None = None,
     table_format: TableFormat | None = None,
 ) -> GnssTable:
-    """Read image, position, three sigmas (m) and optionally heading_deg and camera.
+    """Read image, position, three sigmas (m) and optionally heading_deg, camera and station.
 
     A file may be without any column of sigmas; some of them alone are refused. Raises InputError for columns that are
     missing, values that cannot be, sigmas that are not positive, and images
@@ -58,6 +60,7 @@ def read_gnss(
         sigmas_m=_sigmas(table, crs_kind, image_ids) if stated else np.full((len(table), 3), np.nan),
         heading_deg=_headings(table),
         cameras=table.text("camera") if table.has("camera") else ("",) * len(table),
+        stations=table.text("station") if table.has("station") else ("",) * len(table),
     )
 
 

@@ -14,6 +14,7 @@ _STAGES = {
     "features": "Features",
     "network": "Reference network",
     "localize": "Localization",
+    "stations": "Stations and sequences",
     "adjust": "Adjustment",
     "report": "Report",
 }

@@ -31,9 +31,18 @@ from georef.simulate.project_files import PROJECT, TRUTH, InOrder, Runner, claim
 PRIORS = {"": PositionSystem(15.0, 10.0, 5.0), "_100m": PositionSystem(100.0, 40.0, 10.0)}
 """By the ending of the table's name: the priors that project.toml names, and much weaker ones."""
 
-HEADS = "heads.csv"
+HEADS, RIG = "heads.csv", "rig.csv"
+RIG_SIGMA_M, RIG_SIGMA_DEG = 0.001, 0.01
+"""How well a rig is calibrated, each coordinate and the rotation about each axis."""
+_ON_RIG = ("vehicle", UNDISTORTED)
+_TABLES_VERSION = 2  # rises when the same world is declared by other tables
 _CAMERA_HEADER = "camera,model,width,height,fx,fy,cx,cy,k1,k2,p1,p2,k3,k4"
 _HEAD_HEADER = "head,width,height,fx,fy,cx,cy,x,y,z,yaw,pitch,roll"
+_RIG_HEADER = "camera,x,y,z,yaw,pitch,roll,sigma_m,sigma_deg"
+_RIG_COMMENT = (
+    "# Cameras of the vehicle, as calibrated. x right, y down, z forward in metres, yaw (clockwise), pitch (up), roll "
+    "in degrees; 1-sigma of each coordinate and of the rotation about each axis."
+)
 _HEAD_COMMENT = (
     "# Heads of the panorama. Pixels; the top-left pixel's centre is (0.5, 0.5). x right, y down, z forward in metres, "
     "yaw (clockwise), pitch (up), roll in degrees, all against the middle of the panorama."
@@ -53,11 +62,13 @@ def write_evaluation_tables(world: EvaluationWorld, folder: Path) -> None:
     """All files but the images; nothing is computed where they are there already."""
     claim(world, folder)
     done = folder / TRUTH / "complete.json"
-    if done.is_file():
+    stated = json.dumps({"fingerprint": world.options.fingerprint, "tables": _TABLES_VERSION}) + "\n"
+    if done.is_file() and done.read_text(encoding="utf-8") == stated:
         return
     delivered = _by_epoch(products(world))
     heads = declared_heads(world.rigs[PANORAMA_REFERENCE])
     write_text_atomically(_head_table(heads), folder / HEADS)
+    write_text_atomically(rig_table(world), folder / RIG)
     for epoch, files in delivered.items():
         if epoch not in PANORAMAS and epoch not in PHONES:
             write_text_atomically(camera_table(_lenses(world, files)), folder / f"cameras_{epoch}.csv")
@@ -68,7 +79,7 @@ def write_evaluation_tables(world: EvaluationWorld, folder: Path) -> None:
             _write_truth(world, epoch, files, folder / TRUTH)
     write_text_atomically(camera_table({"phone": world.rigs["phone"].lenses["phone"]}), folder / TRUTH / "cameras.csv")
     write_text_atomically(project_toml(world), folder / PROJECT)
-    write_text_atomically(json.dumps({"fingerprint": world.options.fingerprint}) + "\n", done)
+    write_text_atomically(stated, done)
 
 
 def write_evaluation_images(world: EvaluationWorld, folder: Path, runner: Runner | None = None) -> list[str]:
@@ -141,11 +152,12 @@ def _write_reference(world: EvaluationWorld, epoch: str, files: Sequence[Product
 def _write_positions(world: EvaluationWorld, epoch: str, files: Sequence[Product], folder: Path) -> None:
     poses = _exact(world, files)
     cameras = {p.image_id: p.camera for p in files} if len({p.camera for p in files}) > 1 else {}
+    stations = {p.image_id: str(p.station) for p in files} if epoch in _ON_RIG else None
     source = "vehicle" if epoch == UNDISTORTED else epoch  # the same photographs have the same positions
     for ending, system in PRIORS.items():
         positions, headings = drawn_positions(world, list(poses.values()), system, source + ending)
         placed = dict(zip(poses, positions, strict=True))
-        text = tables.position_table(placed, system.sigmas_m, headings, cameras, world.frame)
+        text = tables.position_table(placed, system.sigmas_m, headings, cameras, world.frame, stations)
         write_text_atomically(text, folder / f"{epoch}_gnss{ending}.csv")
 
 
@@ -171,6 +183,19 @@ def _head_table(heads: Sequence[PanoramaHead]) -> str:
     return tables.table(_HEAD_COMMENT, _HEAD_HEADER, rows)
 
 
+def rig_table(world: EvaluationWorld) -> str:
+    """The vehicle's cameras as their calibration has them: off by what it states."""
+    rig, rng = world.rigs["vehicle"], world.rng("calibration", "vehicle")
+    sigmas = np.array([np.radians(RIG_SIGMA_DEG)] * 3 + [RIG_SIGMA_M] * 3)
+    rows = []
+    for head in rig.heads:
+        found = head.rig_from_cam.retract(sigmas * rng.normal(size=6))
+        angles = np.degrees(yaw_pitch_roll_from_rotation(found.rotation))
+        placed = (f"{v + 0.0:.6f}" for v in (*(RIG_FROM_PANO.T @ found.translation), *angles))
+        rows.append((rig.lenses[head.name].name, *placed, RIG_SIGMA_M, RIG_SIGMA_DEG))
+    return tables.table(_RIG_COMMENT, _RIG_HEADER, rows)
+
+
 def project_toml(world: EvaluationWorld, ending: str = "") -> str:
     """The declarations of an ordinary project of this world's files."""
     quality = world.options.reference
@@ -188,6 +213,7 @@ def project_toml(world: EvaluationWorld, ending: str = "") -> str:
         pano, phone = epoch in PANORAMAS, epoch in PHONES
         camera = _PANORAMA.format(projection="equirectangular") if pano else f'cameras = "cameras_{epoch}.csv"\n'
         camera = _UNKNOWN if phone else camera
+        camera += f'rig = "{RIG}"\n' if epoch in _ON_RIG else ""
         sections.append(f'[epochs.{epoch}]\nimages = "{epoch}"\ngnss = "{epoch}_gnss{ending}.csv"\n{camera}')
     return "\n".join(sections)
 

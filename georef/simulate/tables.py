@@ -91,14 +91,16 @@ def position_table(
     headings_deg: Sequence[float],
     cameras: Mapping[str, str],
     frame: WorldFrame,
+    stations: Mapping[str, str] | None = None,
 ) -> str:
-    """Positions of images with one sigma for all, headings, and camera ids where there are any."""
+    """Positions of images with one sigma for all, headings, and camera and station ids where there are any."""
     positions = frame.crs_from_world(np.array(list(positions_in_world.values())))
     rows = []
     for name, position, heading in zip(positions_in_world, positions, headings_deg, strict=True):
-        camera = [cameras[name]] if cameras else []
-        rows.append((name, *(f"{v:.3f}" for v in (*position, *sigmas_m)), _heading(heading), *camera))
+        named = [names[name] for names in (cameras, stations) if names]
+        rows.append((name, *(f"{v:.3f}" for v in (*position, *sigmas_m)), _heading(heading), *named))
     header = "image,easting,northing,height,sigma_e,sigma_n,sigma_h,heading_deg" + (",camera" if cameras else "")
+    header += ",station" if stations else ""
     return table(_CRS_LINE + _SIGMAS + " Headings: degrees clockwise from true north.", header, rows)
 
 

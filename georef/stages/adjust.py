@@ -18,7 +18,8 @@ from georef.estimation.guided import PosedFeatures
 from georef.geometry.rigid import Array, Rigid3
 from georef.io.items import read_item, write_item
 from georef.stages.base import StageContext, StageSummary, feature_id, open_features
-from georef.stages.localize import make_task, read_outcomes
+from georef.stages.localize import make_task
+from georef.stages.stations import final_outcomes
 from georef.types.results import Localized, with_estimated_cameras
 
 RESULT = "adjusted.npz"
@@ -50,7 +51,7 @@ class AdjustedEpoch:
 
 def run(context: StageContext) -> StageSummary:
     """Adjusts the localized images of the epoch."""
-    config, outcomes = context.config, read_outcomes(context.before["localize"], context.survey.epoch)
+    config, outcomes = context.config, final_outcomes(context)
     epoch = with_estimated_cameras(context.survey.epoch, outcomes)
     localized = [o for o in outcomes if isinstance(o, Localized)]
     if not localized:

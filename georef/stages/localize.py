@@ -151,9 +151,9 @@ def outcomes_exist(context: StageContext) -> bool:
     return all(item_path(items, image.image_id).is_file() for image in context.survey.epoch.images)
 
 
-def read_outcomes(folder: Path, epoch: Campaign) -> list[Outcome]:
+def read_outcomes(folder: Path, epoch: Campaign, items: str = ITEMS) -> list[Outcome]:
     """The outcomes of all images of an epoch, in its order."""
-    return [read_outcome(item_path(folder / ITEMS, image.image_id)) for image in epoch.images]
+    return [read_outcome(item_path(folder / items, image.image_id)) for image in epoch.images]
 
 
 def summary_of(outcomes: list[Outcome], computed: int) -> StageSummary:

@@ -26,7 +26,7 @@ from georef.io.files import write_bytes_atomically
 from georef.io.head_table import read_heads
 from georef.project import PanoramaSection, Project
 from georef.stages.failures import internal_failure
-from georef.types.campaign import Campaign, Image, PositionPrior
+from georef.types.campaign import Campaign, Image, Mounting, PositionPrior
 from georef.types.results import RejectReason
 
 if TYPE_CHECKING:
@@ -99,7 +99,8 @@ def with_heads(
     heads = None if section.heads is None else project.data(section.heads)
     panoramas = Panoramas.of(section, heads, project.panorama_folder)
     pairs = [pair for image in images for pair in panoramas.images_of(image)]
-    return Campaign(epoch, tuple(image for image, _ in pairs)), [cutout for _, cutout in pairs]
+    mountings = {image.image_id: Mounting(cut.head.name, cut.head.pano_from_head) for image, cut in pairs}
+    return Campaign(epoch, tuple(image for image, _ in pairs), mountings), [cutout for _, cutout in pairs]
 
 
 def placeholder(image_id: str, path: Path, epoch: str) -> Image:

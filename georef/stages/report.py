@@ -23,8 +23,8 @@ from georef.report.html import render_html
 from georef.report.plan import Placed
 from georef.stages.adjust import AdjustedEpoch, read_adjusted
 from georef.stages.base import StageContext, StageSummary
-from georef.stages.localize import read_outcomes
 from georef.stages.network import RESULT as NETWORK_RESULT
+from georef.stages.stations import final_outcomes
 from georef.stages.survey import Survey
 from georef.types.constraints import CheckKind
 from georef.types.results import Localized, Outcome, Rejected, with_estimated_cameras
@@ -42,7 +42,7 @@ POSES, LOCALIZATION, REPORT, HTML, RECORDING = (
 def run(context: StageContext) -> StageSummary:
     """Publishes the epoch: poses before and after the adjustment, the report, the recording."""
     folder = context.project.published(context.epoch)
-    outcomes = read_outcomes(context.before["localize"], context.survey.epoch)
+    outcomes = final_outcomes(context)
     survey = replace(context.survey, epoch=with_estimated_cameras(context.survey.epoch, outcomes))
     context = replace(context, survey=survey)
     adjusted = read_adjusted(context.before["adjust"])

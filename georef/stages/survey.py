@@ -17,9 +17,11 @@ from georef.io.columns import CrsKind, PositionTable
 from georef.io.gnss import GnssTable, read_gnss
 from georef.io.marks import check_marks, read_marks
 from georef.io.points import read_points
+from georef.io.rig_table import read_rig
 from georef.io.tables import check_declared_crs, check_declared_height
 from georef.project import Project
 from georef.stages.cameras import CameraTable, Stated, unknown_camera, with_unknown
+from georef.stages.mountings import with_rig
 from georef.stages.panoramas import CutOut, placeholder, with_heads
 from georef.stages.reference import image_files, read_orientations, reference_campaign, table_format, world_poses
 from georef.types.campaign import Campaign, Image, PositionPrior
@@ -85,7 +87,7 @@ def _epoch(
     """All images of the folder and all rows of the GNSS table: each will have an outcome."""
     section = project.file.epochs[epoch]
     folder = project.data(section.images)
-    files, stated, priors = image_files(folder), Stated(), {}
+    files, stated, priors, gnss = image_files(folder), Stated(), {}, None
     if section.gnss is not None:
         gnss = read_gnss(
             project.data(section.gnss),
@@ -111,7 +113,10 @@ def _epoch(
         if section.panorama is None:
             image = replace(image, camera=_new_camera(name, path, table, stated, section.unknown))
         images.append(replace(image, **priors.get(name, {})))
-    return with_heads(project, epoch, images, section.panorama)
+    campaign, cutouts = with_heads(project, epoch, images, section.panorama)
+    if section.rig is None or gnss is None:
+        return campaign, cutouts
+    return with_rig(campaign, read_rig(project.data(section.rig)), gnss.path, project.data(section.rig)), cutouts
 
 
 def _new_camera(name: str, path: Path, table: CameraTable | None, stated: Stated, unknown: tuple[str, ...]) -> Camera:
@@ -122,10 +127,11 @@ def _new_camera(name: str, path: Path, table: CameraTable | None, stated: Stated
 
 
 def _measured(gnss: GnssTable, world: WorldFrame) -> list[dict[str, Any]]:
-    """What each row says of its image: its position with a covariance, or one to search about; its heading (rad)."""
+    """What each row says of its image: a position with covariance, or one to search about; heading (rad), station."""
     positions = world.world_from_crs(gnss.positions_in_crs)
     said: list[dict[str, Any]] = [
-        {"heading_rad": None if np.isnan(heading) else float(np.radians(heading))} for heading in gnss.heading_deg
+        {"heading_rad": None if np.isnan(heading) else float(np.radians(heading)), "station": station or None}
+        for heading, station in zip(gnss.heading_deg, gnss.stations, strict=True)
     ]
     if gnss.unstated:
         return [row | {"near": position} for row, position in zip(said, positions, strict=True)]

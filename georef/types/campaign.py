@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -54,17 +55,34 @@ class Image:
     near: Array | None = (
         None  # (3,) m, a position that nobody states a sigma for: a place to search about, no observation
     )
-    station: str | None = None  # of images that were taken as one, the heads of a panorama: they share a position fix
+    station: str | None = None  # of images that were taken as one, heads of a panorama or of a rig: they share a fix
     heading_rad: float | None = None  # of the optical axis, clockwise from the world's north
     given_sigma: PoseSigma | None = None  # of world_from_cam, where the project declares it
 
 
 @dataclass(frozen=True, eq=False)
+class Mounting:
+    """Where a camera sits on its rig; one calibration for all exposures."""
+
+    camera: str  # the id of a camera, or of a head
+    rig_from_cam: Rigid3
+    cov: Array | None = None  # (6, 6) right perturbation of rig_from_cam; None: exact
+
+    def __post_init__(self) -> None:
+        if self.cov is not None:
+            require_covariance(self.cov, 6)
+
+
+@dataclass(frozen=True, eq=False)
 class Campaign:
-    """The images of one epoch, in the order of the table that lists them."""
+    """The images of one epoch, in the order of the table that lists them.
+
+    mountings: by image id, of images that belong to a station whose rig is known.
+    """
 
     epoch: str
     images: tuple[Image, ...]
+    mountings: Mapping[str, Mounting] = field(default_factory=dict)
 
     def __getitem__(self, image_id: str) -> Image:
         return self._by_id[image_id]

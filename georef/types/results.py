@@ -91,7 +91,7 @@ def with_estimated_cameras(campaign: Campaign, outcomes: Iterable[Outcome]) -> C
     if not cameras:
         return campaign
     images = (replace(i, camera=cameras[i.image_id]) if i.image_id in cameras else i for i in campaign.images)
-    return Campaign(campaign.epoch, tuple(images))
+    return replace(campaign, images=tuple(images))
 
 
 @dataclass(frozen=True)

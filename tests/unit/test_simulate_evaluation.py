@@ -12,7 +12,7 @@ from georef.errors import ConfigError, InputError
 from georef.features.images import read_image
 from georef.features.panorama import cut_head
 from georef.geometry.angles import rotation_from_yaw_pitch_roll
-from georef.geometry.panorama import directions_from_head, head_from_directions
+from georef.geometry.panorama import RIG_FROM_PANO, directions_from_head, head_from_directions
 from georef.geometry.rigid import Rigid3, log_so3
 from georef.io.exif import size_and_focal
 from georef.io.exterior_orientation import read_exterior_orientation
@@ -189,6 +189,34 @@ def test_an_interrupted_writing_goes_on(world: EvaluationWorld, folder: Path) ->
     assert write_evaluation_images(world, folder) == []
     with pytest.raises(InputError, match="other options"):
         write_evaluation_tables(EvaluationWorld(replace(SMALL, seed=3)), folder)
+
+
+def test_the_rig_is_off_by_what_its_table_states_and_its_images_have_stations(
+    project: Project, world: EvaluationWorld
+) -> None:
+    survey = load_survey(project, "vehicle")
+    heads = {world.rigs["vehicle"].lenses[head.name].name: head for head in world.rigs["vehicle"].heads}
+    middle = Rigid3(RIG_FROM_PANO, np.zeros(3))
+    for image in survey.epoch.images:
+        mounting = survey.epoch.mountings[image.image_id]
+        assert mounting.cov is not None
+        error = heads[mounting.camera].rig_from_cam.local(middle @ mounting.rig_from_cam)
+        assert 0.2 < error @ np.linalg.solve(mounting.cov, error) / 6 < 4.0
+    stations = {image.station for image in survey.epoch.images}
+    assert len(stations) == SMALL.new_stations
+    assert len(survey.epoch.images) == 2 * len(stations)
+
+
+def test_tables_of_an_older_version_are_written_again(world: EvaluationWorld, tmp_path: Path) -> None:
+    write_evaluation_tables(world, tmp_path / "data")
+    done = tmp_path / "data" / TRUTH / "complete.json"
+    done.write_text('{"fingerprint": "of before"}', encoding="utf-8")
+    rig, positions = (tmp_path / "data" / name for name in ("rig.csv", "vehicle_gnss.csv"))
+    before = positions.read_text(encoding="utf-8")
+    rig.unlink()
+    write_evaluation_tables(world, tmp_path / "data")
+    assert rig.is_file()
+    assert positions.read_text(encoding="utf-8") == before
 
 
 def test_the_project_in_the_repository_is_the_one_that_is_written() -> None:
