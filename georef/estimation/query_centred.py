@@ -21,13 +21,13 @@ def query_centred(query: Query, ranked: NDArray[np.int64]) -> Outcome:
     """A first pose from a few references by the matcher, then guided matching in all that see the same points."""
     first = None
     for count in sorted({query.search.config.first_count, query.search.config.count}):
-        first = _first_pose(query, [int(i) for i in ranked[:count]])
+        first = first_pose_of(query, [int(i) for i in ranked[:count]])
         if not isinstance(first, Rejected):
             break
     if first is None or isinstance(first, Rejected):
         return first or Rejected(query.image.image_id, RejectReason.NO_CANDIDATES, "no reference image")
     pose, model = first
-    chosen = _that_see(query, ranked, pose, model)
+    chosen = that_see(query, ranked, pose, model)
     estimate, model = _guided_pose(query, pose, chosen)
     if query.image.camera.estimate and estimate is not None:  # its lines were those of a camera from few matches
         query.use(estimate.camera)
@@ -44,7 +44,7 @@ def _guided_pose(query: Query, pose: Rigid3, chosen: Sequence[int]) -> tuple[Est
         return refine_pose(pose, query.observed, model, lambda v: query.reference.pose_cov(chosen[v])), model
 
 
-def _first_pose(query: Query, indices: list[int]) -> tuple[Rigid3, LocalModel] | Rejected:
+def first_pose_of(query: Query, indices: list[int]) -> tuple[Rigid3, LocalModel] | Rejected:
     matches = [matched(query, index) for index in indices]
     with query.timed("pose"):
         references = [query.reference.posed(i) for i in indices]
@@ -69,7 +69,7 @@ def _first_pose(query: Query, indices: list[int]) -> tuple[Rigid3, LocalModel] |
         return refined.world_from_cam, model
 
 
-def _that_see(query: Query, ranked: NDArray[np.int64], pose: Rigid3, model: LocalModel) -> list[int]:
+def that_see(query: Query, ranked: NDArray[np.int64], pose: Rigid3, model: LocalModel) -> list[int]:
     """The references that see most of the points from a similar side, at most `count`, already matched ones first."""
     with query.timed("candidates"):
         directions = model.points - pose.translation
