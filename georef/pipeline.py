@@ -18,7 +18,7 @@ from georef.config import Config
 from georef.executor import Executor
 from georef.io.files import write_text_atomically
 from georef.project import Project
-from georef.stages import adjust, features, global_map, index, localize, network, report
+from georef.stages import adjust, features, global_map, index, localize, network, report, tracks
 from georef.stages.base import Meter, Run, StageContext, StageSummary, feature_id
 from georef.stages.survey import Survey, load_survey
 from georef.types.campaign import Campaign
@@ -82,6 +82,13 @@ _NETWORK_KEYS = (
 )
 
 _MAP_KEYS = ("matching", "global_map", "candidates.epochs")
+_TRACKS_KEYS = (
+    "tracks",
+    "localize.guided_gate",
+    "localize.guided_min_similarity",
+    "localize.guided_ratio",
+    "candidates.epochs",
+)
 _LOCALIZE_KEYS = ("matching", "candidates", "localize")
 
 
@@ -93,14 +100,26 @@ def _uses_map(config: Config) -> bool:
     return config.localize.method == "global-model"
 
 
+def _uses_tracks(config: Config) -> bool:
+    return config.localize.method == "tracks"
+
+
 STAGES: tuple[Stage, ...] = (
     Stage("features", 2, ("features",), _all_images, (), features.run),
     Stage("network", 3, _NETWORK_KEYS, _reference_with_images, (), network.run, of_reference=True),
     Stage("index", 1, ("retrieval",), _reference_with_images, (), index.run, _uses_index, of_reference=True),
     Stage(
-        "global-map", 1, _MAP_KEYS, _reference_with_images, ("network",), global_map.run, _uses_map, of_reference=True
+        "global-map", 2, _MAP_KEYS, _reference_with_images, ("network",), global_map.run, _uses_map, of_reference=True
     ),
-    Stage("localize", 4, _LOCALIZE_KEYS, _epoch_files, ("features", "network", "index", "global-map"), localize.run),
+    Stage("tracks", 1, _TRACKS_KEYS, _reference_with_images, ("network",), tracks.run, _uses_tracks, of_reference=True),
+    Stage(
+        "localize",
+        4,
+        _LOCALIZE_KEYS,
+        _epoch_files,
+        ("features", "network", "index", "global-map", "tracks"),
+        localize.run,
+    ),
     Stage("adjust", 4, ("adjust", "localize", "matching"), _control, ("features", "network", "localize"), adjust.run),
     Stage("report", 2, ("report",), _check, ("features", "network", "localize", "adjust"), report.run),
 )
@@ -209,6 +228,7 @@ def _results_exist(context: StageContext, stage: str) -> bool:
         "network": context.folder / network.RESULT,
         "index": context.folder / index.VECTORS,
         "global-map": context.folder / global_map.STRUCTURE,
+        "tracks": context.folder / global_map.STRUCTURE,
         "adjust": context.folder / adjust.RESULT,
     }
     checks = {"localize": localize.outcomes_exist, "report": report.outputs_exist}

@@ -102,7 +102,9 @@ def _by_descriptors(query: Query, candidates: Sequence[int]) -> tuple[EstimatedP
         return _refined(query, found.world_from_cam, model, names)
 
 
-def _refined(query: Query, pose, model: LocalModel, names: Sequence[int]) -> tuple[EstimatedPose, LocalModel] | Rejected:
+def _refined(
+    query: Query, pose, model: LocalModel, names: Sequence[int]
+) -> tuple[EstimatedPose, LocalModel] | Rejected:
     estimate = refine_pose(pose, query.observed, model, _covs(query, names))
     if estimate is None:
         detail = f"{len(model)} points do not fix the pose"

@@ -134,7 +134,7 @@ class _Links:
 def _links(images: Sequence[PosedFeatures], matches: Mapping[Pair, Matches]) -> _Links:
     count = np.array([len(image.features) for image in images], dtype=np.int64)
     start = np.cumsum(count) - count
-    parts = [m.indices.astype(np.int64) + [start[a], start[b]] for (a, b), m in matches.items()]
+    parts = [m.indices.astype(np.int64) + np.array([start[a], start[b]]) for (a, b), m in matches.items()]
     score = np.concatenate([np.zeros(0, np.float32), *(m.scores for m in matches.values())])
     ends = np.concatenate([np.zeros((0, 2), np.int64), *parts])[np.argsort(-score, kind="stable")]
     return _Links(

@@ -121,7 +121,7 @@ def make_task(context: StageContext) -> LocalizeTask:
     if len(usable) < 2:
         raise StageError(f"Only {len(usable)} reference images can be used, at least two are needed.")
     campaign, folders = Campaign(reference.epoch, usable), context.before
-    index, precomputed = folders.get("index"), folders.get("global-map")
+    index, precomputed = folders.get("index"), folders.get("tracks", folders.get("global-map"))
     return LocalizeTask(campaign, noise, folders["store"], context.config, failed, index, precomputed)
 
 
