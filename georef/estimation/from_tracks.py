@@ -8,7 +8,7 @@ with the smaller discs.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +21,7 @@ from georef.estimation.query import Query, consensus, outcome_of
 from georef.estimation.query_centred import first_pose_of, that_see
 from georef.estimation.seen_tracks import SeenTracks, associate, local_model_of
 from georef.features.nearest import MutualNearest
+from georef.geometry.rigid import Array, Rigid3
 from georef.types.results import Outcome, Rejected, RejectReason
 
 _VOTE_RATIO = 0.95
@@ -103,7 +104,7 @@ def _by_descriptors(query: Query, candidates: Sequence[int]) -> tuple[EstimatedP
 
 
 def _refined(
-    query: Query, pose, model: LocalModel, names: Sequence[int]
+    query: Query, pose: Rigid3, model: LocalModel, names: Sequence[int]
 ) -> tuple[EstimatedPose, LocalModel] | Rejected:
     estimate = refine_pose(pose, query.observed, model, _covs(query, names))
     if estimate is None:
@@ -113,5 +114,5 @@ def _refined(
     return estimate, model.take(estimate.inliers)
 
 
-def _covs(query: Query, names: Sequence[int]):
+def _covs(query: Query, names: Sequence[int]) -> Callable[[int], Array]:
     return lambda view: query.reference.pose_cov(names[view])

@@ -102,7 +102,7 @@ def guided_options(config: LocalizeConfig) -> GuidedOptions:
 
 
 def _state(context: StageContext, image: Image) -> str:
-    """What the matches of a reference depend on: its file and the extractor, which decide its features, and its pose."""
+    """What the matches of a reference depend on: its features, by their file and extractor, its camera and its pose."""
     assert image.world_from_cam is not None
     status = context.survey.source_of(image).stat()
     return _digest(
