@@ -16,7 +16,7 @@ from scipy.stats import chi2
 
 from georef.estimation.first_pose import QueryImage
 from georef.estimation.guided import GuidedOptions, PosedFeatures, mutual_best
-from georef.estimation.local_model import LocalModel, triangulate_consistent
+from georef.estimation.local_model import LocalModel
 from georef.estimation.pnp import EstimatedPose
 from georef.features.nearest import unit_rows
 from georef.geometry.camera import Camera
@@ -28,7 +28,6 @@ _LARGEST_ANGLE_DEG = 60.0
 _LARGEST_SCALE_RATIO = 3.0
 _LOOKS = 3  # observations of a track whose descriptors are compared, the most similar in direction and scale
 _ANGLE_OF_DOUBLE_RAD = np.radians(30.0)  # an angle between rays that makes as unlike as twice the scale
-_AGREEMENT = 3.5  # sigmas of a keypoint
 _GATE = float(chi2.ppf(0.999, 2))
 _LARGEST_RADIUS_SHARE = 0.1  # of the longer image side: a first pose less sure than that is looked around no farther
 
@@ -125,20 +124,6 @@ def local_model_of(
     chosen = [int(name) for name in names]
     points, cov = seen.points[pairs[:, 0]], seen.cov[pairs[:, 0]]
     return LocalModel(pairs[:, 1], points, cov, views_of(chosen), numbered), chosen
-
-
-def from_similar_side(model: LocalModel, compared: NDArray[np.bool_], world_from_cam: Rigid3) -> LocalModel:
-    """The same points, intersected again from what the compared views (V,) see from a side similar to the query's.
-
-    Of one corner or stone an image from another side shows another spot: a point from all sides is none of them.
-    """
-    obs = model.observations
-    to_query = model.points[obs.point] - world_from_cam.translation
-    to_view = model.points[obs.point] - model.views.centres[obs.view]
-    length = np.linalg.norm(to_query, axis=1) * np.linalg.norm(to_view, axis=1)
-    cosine = np.einsum("ni,ni->n", to_query, to_view) / np.maximum(length, 1e-12)
-    kept = compared[obs.view] & (cosine >= np.cos(np.radians(_LARGEST_ANGLE_DEG)))
-    return triangulate_consistent(model.views, model.keypoint, obs.take(kept), _AGREEMENT)
 
 
 def _rows(index: int, structure: ImageStructure) -> NDArray[np.int64]:
