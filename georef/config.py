@@ -72,7 +72,7 @@ class CandidatesConfig(Section):
 
 
 class LocalizeConfig(Section):
-    method: Literal["query-centred", "published", "global-model"] = "query-centred"
+    method: Literal["query-centred", "tracks", "published", "global-model"] = "query-centred"
     ransac_gate_px: float = Field(default=12.0, gt=0)
     guided_gate: float = Field(default=3.0, gt=0)
     guided_min_similarity: float = Field(default=0.6, ge=0, le=1)
@@ -89,6 +89,12 @@ class GlobalMapConfig(Section):
     neighbours: int = Field(default=10, ge=1)
     viewing_reach_m: float = Field(default=30.0, gt=0)
     gate: float = Field(default=3.0, gt=0)
+    block_images: int = Field(default=100, ge=2)
+
+
+class TracksConfig(Section):
+    neighbours: int = Field(default=10, ge=1)
+    viewing_reach_m: float = Field(default=30.0, gt=0)
     block_images: int = Field(default=100, ge=2)
 
 
@@ -152,6 +158,7 @@ class Config(Section):
     candidates: CandidatesConfig = CandidatesConfig()
     localize: LocalizeConfig = LocalizeConfig()
     network: NetworkConfig = NetworkConfig()
+    tracks: TracksConfig = TracksConfig()
     global_map: GlobalMapConfig = GlobalMapConfig()
     stations: StationsConfig = StationsConfig()
     adjust: AdjustConfig = AdjustConfig()

@@ -18,7 +18,18 @@ from georef.config import Config
 from georef.executor import Executor
 from georef.io.files import write_text_atomically
 from georef.project import Project
-from georef.stages import adjust, features, global_map, index, leave_one_out, localize, network, report, stations
+from georef.stages import (
+    adjust,
+    features,
+    global_map,
+    index,
+    leave_one_out,
+    localize,
+    network,
+    report,
+    stations,
+    tracks,
+)
 from georef.stages.base import Meter, Run, StageContext, StageSummary
 from georef.stages.fingerprints import (
     all_images,
@@ -63,7 +74,15 @@ _NETWORK_KEYS = (
 )
 
 _MAP_KEYS = ("matching", "global_map", "candidates.epochs")
+_TRACKS_KEYS = (
+    "tracks",
+    "localize.guided_gate",
+    "localize.guided_min_similarity",
+    "localize.guided_ratio",
+    "candidates.epochs",
+)
 LOCALIZE_KEYS = ("matching", "candidates", "localize")
+_BEFORE_LOCALIZE = ("features", "network", "index", "global-map", "tracks")
 _STATION_KEYS = ("stations", "localize", "candidates.epochs")
 _BEFORE_STATIONS = ("features", "network", "localize")
 _BEFORE_ADJUST = (*_BEFORE_STATIONS, "stations")
@@ -77,14 +96,19 @@ def _uses_map(config: Config) -> bool:
     return config.localize.method == "global-model"
 
 
+def _uses_tracks(config: Config) -> bool:
+    return config.localize.method == "tracks"
+
+
 STAGES: tuple[Stage, ...] = (
     Stage("features", 2, ("features",), all_images, (), features.run),
     Stage("network", 4, _NETWORK_KEYS, reference_with_images, (), network.run, of_reference=True),
     Stage("index", 1, ("retrieval",), reference_with_images, (), index.run, _uses_index, of_reference=True),
     Stage(
-        "global-map", 1, _MAP_KEYS, reference_with_images, ("network",), global_map.run, _uses_map, of_reference=True
+        "global-map", 2, _MAP_KEYS, reference_with_images, ("network",), global_map.run, _uses_map, of_reference=True
     ),
-    Stage("localize", 5, LOCALIZE_KEYS, epoch_files, ("features", "network", "index", "global-map"), localize.run),
+    Stage("tracks", 1, _TRACKS_KEYS, reference_with_images, ("network",), tracks.run, _uses_tracks, of_reference=True),
+    Stage("localize", 5, LOCALIZE_KEYS, epoch_files, _BEFORE_LOCALIZE, localize.run),
     Stage("stations", 1, _STATION_KEYS, mountings, _BEFORE_STATIONS, stations.run, applies=stations.wanted),
     Stage("adjust", 6, ("adjust", "localize", "matching"), control, _BEFORE_ADJUST, adjust.run),
     Stage("report", 2, ("report",), check, (*_BEFORE_ADJUST, "adjust"), report.run),
@@ -198,6 +222,7 @@ def _results_exist(context: StageContext, stage: str) -> bool:
         "network": context.folder / network.RESULT,
         "index": context.folder / index.VECTORS,
         "global-map": context.folder / global_map.STRUCTURE,
+        "tracks": context.folder / global_map.STRUCTURE,
         "adjust": context.folder / adjust.RESULT,
     }
     checks = {"localize": localize.outcomes_exist, "stations": localize.outcomes_exist, "report": report.outputs_exist}

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from georef.config import CandidatesConfig, LocalizeConfig
 from georef.estimation.candidates import Box, Whereabouts
+from georef.estimation.from_tracks import from_tracks
 from georef.estimation.pose_from_map import from_global_model, from_local_model
 from georef.estimation.prior_check import STRONG_EVIDENCE, against_prior
 from georef.estimation.query import Query
@@ -23,6 +24,7 @@ from georef.types.results import Localized, Outcome, Rejected, RejectReason
 
 METHODS: dict[str, Callable[[Query, NDArray], Outcome]] = {  # of references, the most promising first
     "query-centred": query_centred,
+    "tracks": from_tracks,
     "published": from_local_model,
     "global-model": from_global_model,
 }

@@ -24,7 +24,7 @@ def query_centred(query: Query, ranked: NDArray[np.int64]) -> Outcome:
     """A first pose from a few references by the matcher, then guided matching in all that see the same points."""
     first = None
     for count in sorted({query.search.config.first_count, query.search.config.count}):
-        first = _first_pose(query, [int(i) for i in ranked[:count]])
+        first = first_pose_of(query, [int(i) for i in ranked[:count]])
         if not isinstance(first, Rejected):
             break
     if first is None or isinstance(first, Rejected):
@@ -115,7 +115,7 @@ def _contradiction(query: Query, found: _Guided, estimate: EstimatedPose) -> Con
     return contradiction(matched, observed, estimate.world_from_cam, found.model.take(estimate.inliers))
 
 
-def _first_pose(query: Query, indices: list[int]) -> tuple[Rigid3, LocalModel] | Rejected:
+def first_pose_of(query: Query, indices: list[int]) -> tuple[Rigid3, LocalModel] | Rejected:
     matches = [matched(query, index) for index in indices]
     with query.timed("pose"):
         references = [query.reference.posed(i) for i in indices]

@@ -2,14 +2,35 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 
 from georef.errors import StageError
 from georef.io.items import read_item, write_item
+from georef.types.features import Matches
 from georef.types.scene import ImageStructure, Observations
+
+
+def write_matches(path: Path, matches: Mapping[str, Matches], keys: Mapping[str, str] | None = None) -> None:
+    """Stores the matches of one image with others, by their names; keys say what a pair was matched from."""
+    arrays: dict[str, np.ndarray] = {}
+    for number, found in enumerate(matches.values()):
+        arrays |= {f"matches_{number}": found.indices, f"scores_{number}": found.scores.astype(np.float16)}
+    header = {"partners": list(matches), "keys": [(keys or {}).get(name, "") for name in matches]}
+    write_item(path, header, arrays)
+
+
+def read_matches(path: Path, known: Collection[str] | None = None) -> tuple[list[str], list[Matches]]:
+    """The names of an image's partners, and its matches with each; with `known` those of these keys alone.
+
+    Raises StageError for a file that is missing or damaged.
+    """
+    header, arrays = read_item(path)
+    wanted = [k for k, key in enumerate(header["keys"]) if known is None or key in known]
+    found = [Matches(arrays[f"matches_{k}"], arrays[f"scores_{k}"].astype(np.float32)) for k in wanted]
+    return [header["partners"][k] for k in wanted], found
 
 
 def write_structure(path: Path, structure: ImageStructure, image_ids: Sequence[str]) -> None:
@@ -39,7 +60,7 @@ def read_structure(path: Path, places: Mapping[str, int]) -> ImageStructure:
     if unknown:
         raise StageError(
             f"The precomputed map has points of reference image '{unknown[0]}', which takes no part now.",
-            "Delete the folder of the stage `global-map` and run again.",
+            "Delete the folder of the stage that made it and run again.",
             f"In {path}.",
         )
     place = np.array([places[name] for name in header["images"]], dtype=np.int64)

@@ -7,7 +7,7 @@ no points, which is logged and told in the summary; the others go on.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 from georef.estimation.global_model import Pair, block_structure, blocks_of, choose_pairs, match_pair
 from georef.estimation.guided import PosedFeatures
 from georef.geometry.frusta import Frusta
-from georef.io.items import item_ids, item_path, read_item, write_item
-from georef.io.structures import read_structure, write_structure
+from georef.io.items import item_ids, item_path
+from georef.io.structures import read_matches, read_structure, write_matches, write_structure
 from georef.stages.base import StageContext, StageSummary
 from georef.stages.failures import internal_failure
 from georef.stages.localize import STRUCTURE, LocalizeTask, make_task
@@ -47,6 +47,11 @@ class MapTask:
             for index in pair:
                 out[index].append(pair)
         return out
+
+    @cached_property
+    def places(self) -> dict[str, int]:
+        """The place of each reference by its id."""
+        return {name: k for k, name in enumerate(self.ids)}
 
     def path(self, kind: str, index: int) -> Path:
         return item_path(self.folder / kind, self.ids[index])
@@ -78,9 +83,7 @@ class MatchTask(MapTask):
                     found[other] = match_pair(posed[index], posed[other], matcher, count, gate)
                 except Exception as error:
                     internal_failure(error, f"matching of references {self.ids[index]} and {self.ids[other]}")
-        header = {"partners": [self.ids[other] for other in found]}
-        arrays = {f"matches_{k}": matches.indices for k, matches in enumerate(found.values())}
-        write_item(self.path(MATCHES, index), header, arrays)
+        write_matches(self.path(MATCHES, index), {self.ids[other]: matches for other, matches in found.items()})
         return sum(map(len, found.values()))
 
 
@@ -101,9 +104,9 @@ class TriangulateTask(MapTask):
         if not block:
             return {}
         members = {*block, *(i for k in block for pair in self.partners[k] for i in pair)} & posed.keys()
-        matches = {pair: m for i in sorted(members) for pair, m in self._matches(i).items() if members.issuperset(pair)}
+        matches = {pair: m for i in sorted(members) for pair, m in self.matches(i).items() if members.issuperset(pair)}
         try:
-            return block_structure(block, {i: posed[i] for i in members}, matches, self.localize.noise)
+            return self.solved(block, {i: posed[i] for i in members}, matches)
         except Exception as error:
             internal_failure(error, f"triangulation of {len(block)} references from {self.ids[block[0]]} on")
         if len(block) == 1:
@@ -111,11 +114,18 @@ class TriangulateTask(MapTask):
         half = len(block) // 2
         return self._triangulated(block[:half], posed) | self._triangulated(block[half:], posed)
 
-    def _matches(self, index: int) -> dict[Pair, NDArray[np.int32]]:
-        header, arrays = read_item(self.path(MATCHES, index))
-        place = {name: k for k, name in enumerate(self.ids)}
-        pairs = [(index, place[name]) for name in header["partners"]]
-        return {pair: m for k, pair in enumerate(pairs) if len(m := arrays[f"matches_{k}"])}
+    def matches(self, index: int) -> dict[Pair, Matches]:
+        """The stored matches of an image with its partners behind it that there are any with."""
+        partners, found = read_matches(self.path(MATCHES, index))
+        pairs = [(index, self.places[name]) for name in partners]
+        return {pair: m for pair, m in zip(pairs, found, strict=True) if len(m)}
+
+    def solved(
+        self, block: list[int], posed: Mapping[int, PosedFeatures], matches: Mapping[Pair, Matches]
+    ) -> dict[int, ImageStructure]:
+        """The structure of the images of a block from those and their partners."""
+        indices = {pair: m.indices for pair, m in matches.items()}
+        return block_structure(block, posed, indices, self.localize.noise)
 
 
 def run(context: StageContext) -> StageSummary:
@@ -125,27 +135,35 @@ def run(context: StageContext) -> StageSummary:
     pairs = tuple(choose_pairs(Frusta.of(reference.poses, cameras, config.viewing_reach_m), config.neighbours))
     match = MatchTask(make_task(context), context.folder, ids, pairs)
     triangulate = TriangulateTask(make_task(context), context.folder, ids, pairs)
-    done = item_ids(context.folder / MATCHES)
+    computed = map_references(context, match, triangulate, config.block_images)
+    return summary_of(triangulate, computed)
+
+
+def map_references(
+    context: StageContext, match: Callable[[int], int], triangulate: TriangulateTask, block_images: int
+) -> int:
+    """Runs both tasks over what has no result yet; returns how many images were matched."""
+    done, ids = item_ids(context.folder / MATCHES), triangulate.ids
     pending = [index for index, name in enumerate(ids) if name not in done]
     for _ in context.executor.map_items(match, pending, "map matching"):
         pass
     there = item_ids(context.folder / STRUCTURE)
     blocks = [
         block
-        for block in blocks_of(reference.positions, config.block_images)
+        for block in blocks_of(triangulate.localize.map.positions, block_images)
         if not there.issuperset(ids[int(i)] for i in block)
     ]
     for _ in context.executor.map_items(triangulate, blocks, "map points"):
         pass
-    return _summary(triangulate, len(pairs), len(pending))
+    return len(pending)
 
 
-def _summary(task: MapTask, pairs: int, computed: int) -> StageSummary:
-    places = {name: k for k, name in enumerate(task.ids)}
-    points = observations = 0
+def summary_of(task: MapTask, computed: int) -> StageSummary:
+    """How many points there are, and which references have none."""
+    pairs, points, observations = len(task.pairs), 0, 0
     without = []
     for index in range(len(task.ids)):
-        structure = read_structure(task.path(STRUCTURE, index), places)
+        structure = read_structure(task.path(STRUCTURE, index), task.places)
         points += int(np.count_nonzero(structure.identity[:, 0] == index))
         observations += len(structure)
         without += [] if len(structure) else [task.ids[index]]

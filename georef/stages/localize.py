@@ -132,7 +132,7 @@ def make_task(context: StageContext) -> LocalizeTask:
         raise StageError(f"Only {len(usable)} reference images can be used, at least two are needed.")
     campaign, folders = Campaign(context.survey.reference.epoch, usable), context.before
     noise, failed = read_noise(folders["network"])[0], failed_images(folders["features"])
-    index, precomputed = folders.get("index"), folders.get("global-map")
+    index, precomputed = folders.get("index"), folders.get("tracks", folders.get("global-map"))
     cut = {cutout.path for cutout in context.survey.cutouts}  # of panoramas, which stand upright
     upright = frozenset(image.image_id for image in context.survey.epoch.images if image.path in cut)
     return LocalizeTask(campaign, noise, folders["store"], context.config, failed, index, precomputed, upright)

@@ -185,13 +185,13 @@ from georef.pipeline import run_pipeline
 from georef.project import open_project
 from georef.stages import global_map
 
-original, calls = global_map.write_item, []
+original, calls = global_map.write_matches, []
 def killed(*arguments):
     calls.append(1)
     if len(calls) == 4:
         os.kill(os.getpid(), signal.SIGKILL)
     return original(*arguments)
-global_map.write_item = killed
+global_map.write_matches = killed
 settings = ("localize.method=global-model", "global_map.block_images=3")
 project = open_project(Path(sys.argv[1]), output=Path(sys.argv[2]), settings=settings)
 list(run_pipeline(project, sys.argv[3], Executor(), "localize"))
