@@ -3,7 +3,7 @@
 The first pose comes from descriptors of tracks in the most promising references, or from the matcher where these are
 not enough. Then the map points that it sees from a similar side are projected into the query, and compared with the
 keypoints within the disc that the covariances of pose, point and keypoint allow; the pose is refined, and once more
-with the smaller discs.
+with the smaller discs, on points as they are seen from the side of the query.
 """
 
 from __future__ import annotations
@@ -20,14 +20,12 @@ from georef.estimation.local_model import LocalModel
 from georef.estimation.pnp import EstimatedPose, refine_pose
 from georef.estimation.query import Query, consensus, outcome_of
 from georef.estimation.query_centred import first_pose_of
-from georef.estimation.seen_tracks import SeenTracks, associate, local_model_of
+from georef.estimation.seen_tracks import SeenTracks, as_seen_from, associate, local_model_of
 from georef.features.nearest import MutualNearest
 from georef.geometry.rigid import Rigid3
 from georef.types.results import Outcome, Rejected, RejectReason
 
 _VOTE_RATIO = 0.95
-_ROUNDS = 2
-_TURN_RAD, _SHIFT_M = np.radians(1.0), 0.5  # 1-sigma of a first pose that no covariance is known of
 
 
 def from_tracks(query: Query, ranked: NDArray[np.int64]) -> Outcome:
@@ -37,11 +35,13 @@ def from_tracks(query: Query, ranked: NDArray[np.int64]) -> Outcome:
         return first
     estimate, model = first
     names: list[int] = []
-    for _ in range(_ROUNDS):
+    for last in (False, True):
         with query.timed("candidates"):
             chosen = _that_see(query, ranked, estimate.world_from_cam, model)
         with query.timed("map points"):
             model, names = _found(query, estimate, chosen)
+            if last:
+                model = as_seen_from(model, estimate.world_from_cam, query.reference.noise)
         with query.timed("pose"):
             refined = refine_pose(estimate.world_from_cam, query.observed, model, query.reference.errors(names))
         if refined is None:

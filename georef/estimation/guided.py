@@ -162,7 +162,7 @@ def within_band(a: PosedFeatures, b: PosedFeatures, pairs: NDArray[np.integer], 
     Images from one place have no epipolar planes: no pair does.
     """
     limits = gate * np.column_stack([a.features.scales_px[pairs[:, 0]], b.features.scales_px[pairs[:, 1]]])
-    return (epipolar_distances(a, b, pairs) <= limits).all(axis=1)
+    return np.asarray((epipolar_distances(a, b, pairs) <= limits).all(axis=1))
 
 
 def epipolar_band(a: PosedFeatures, b: PosedFeatures, gate: float) -> NDArray[np.bool_]:

@@ -7,7 +7,7 @@ the disc descriptors decide, those of the references that see the point most lik
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,18 +16,21 @@ from scipy.stats import chi2
 
 from georef.estimation.first_pose import QueryImage
 from georef.estimation.guided import GuidedOptions, PosedFeatures, mutual_best
-from georef.estimation.local_model import LocalModel
+from georef.estimation.local_model import LocalModel, triangulate_consistent
 from georef.estimation.pnp import EstimatedPose
+from georef.estimation.tracks import nearest_ray_angles
 from georef.features.nearest import unit_rows
 from georef.geometry.camera import Camera
 from georef.geometry.projection import Views, linearize
 from georef.geometry.rigid import Array, Rigid3
+from georef.types.results import ReferenceNoise
 from georef.types.scene import ImageStructure, Observations
 
 _LARGEST_ANGLE_DEG = 60.0
 _LARGEST_SCALE_RATIO = 3.0
 _LOOKS = 3  # observations of a track whose descriptors are compared, the most similar in direction and scale
 _ANGLE_OF_DOUBLE_RAD = np.radians(30.0)  # an angle between rays that makes as unlike as twice the scale
+_AGREEMENT = 3.5  # sigmas of a keypoint
 _GATE = float(chi2.ppf(0.999, 2))
 _LARGEST_RADIUS_SHARE = 0.1  # of the longer image side: a first pose less sure than that is looked around no farther
 
@@ -118,12 +121,26 @@ def local_model_of(
     fields = ("point", "view", "pixel", "sigma_px", "keypoint")
     observations = Observations(*(np.concatenate([getattr(part, name) for part in parts]) for name in fields))
     names, view = np.unique(observations.view, return_inverse=True)
-    numbered = Observations(
-        observations.point, view.astype(np.int64), observations.pixel, observations.sigma_px, observations.keypoint
-    )
+    numbered = replace(observations, view=view.astype(np.int64))
     chosen = [int(name) for name in names]
     points, cov = seen.points[pairs[:, 0]], seen.cov[pairs[:, 0]]
     return LocalModel(pairs[:, 1], points, cov, views_of(chosen), numbered), chosen
+
+
+def as_seen_from(model: LocalModel, world_from_cam: Rigid3, noise: ReferenceNoise) -> LocalModel:
+    """The same points, intersected again: what sees them from another side than the query counts less.
+
+    From another side a keypoint sits on a slightly different spot of the same thing, and what is wanted is the spot
+    that the query shows. The observations come weighted for the angle to the nearest other ray of their point.
+    """
+    obs, centres = model.observations, model.views.centres
+    to_query = model.points[obs.point] - world_from_cam.translation
+    to_view = model.points[obs.point] - centres[obs.view]
+    length = np.linalg.norm(to_query, axis=1) * np.linalg.norm(to_view, axis=1)
+    cosine = np.einsum("ni,ni->n", to_query, to_view) / np.maximum(length, 1e-12)
+    own = obs.sigma_px / noise.widening(nearest_ray_angles(model.points, obs, centres))
+    widened = replace(obs, sigma_px=own * noise.widening(np.arccos(np.clip(cosine, -1.0, 1.0))))
+    return triangulate_consistent(model.views, model.keypoint, widened, _AGREEMENT)
 
 
 def _rows(index: int, structure: ImageStructure) -> NDArray[np.int64]:
