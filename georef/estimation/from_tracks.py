@@ -19,7 +19,7 @@ from georef.estimation.guided import GuidedOptions
 from georef.estimation.local_model import LocalModel
 from georef.estimation.pnp import EstimatedPose, refine_pose
 from georef.estimation.query import Query, consensus, outcome_of
-from georef.estimation.query_centred import first_pose_of
+from georef.estimation.query_centred import first_pose
 from georef.estimation.seen_tracks import SeenTracks, as_seen_from, associate, local_model_of
 from georef.features.nearest import MutualNearest
 from georef.geometry.rigid import Rigid3
@@ -69,14 +69,10 @@ def _first(query: Query, ranked: NDArray[np.int64]) -> tuple[EstimatedPose, Loca
         if not isinstance(found, Rejected):
             return found
     query.notes.append("first pose by the matcher: descriptors of tracks were not enough")
-    for count in sorted({query.search.config.first_count, query.search.config.count}):
-        indices = [int(i) for i in ranked[:count]]
-        first = first_pose_of(query, indices)
-        if not isinstance(first, Rejected):
-            break
+    first = first_pose(query, ranked)
     if isinstance(first, Rejected):
         return first
-    pose, model = first
+    pose, model, indices = first
     with query.timed("pose"):
         return _refined(query, pose, model, indices)
 

@@ -22,14 +22,10 @@ _MOST_LEFT_OUT = 3  # contradictions of one query; with more, it is not the refe
 
 def query_centred(query: Query, ranked: NDArray[np.int64]) -> Outcome:
     """A first pose from a few references by the matcher, then guided matching in all that see the same points."""
-    first = None
-    for count in sorted({query.search.config.first_count, query.search.config.count}):
-        first = first_pose_of(query, [int(i) for i in ranked[:count]])
-        if not isinstance(first, Rejected):
-            break
-    if first is None or isinstance(first, Rejected):
-        return first or Rejected(query.image.image_id, RejectReason.NO_CANDIDATES, "no reference image")
-    pose, model = first
+    first = first_pose(query, ranked)
+    if isinstance(first, Rejected):
+        return first
+    pose, model, _ = first
     order = _in_order(query, ranked, pose, model)
     found = _guided_poses(query, pose, order)
     if query.image.camera.estimate and found.estimate is not None:  # its lines were those of a camera from few matches
@@ -115,7 +111,19 @@ def _contradiction(query: Query, found: _Guided, estimate: EstimatedPose) -> Con
     return contradiction(matched, observed, estimate.world_from_cam, found.model.take(estimate.inliers))
 
 
-def first_pose_of(query: Query, indices: list[int]) -> tuple[Rigid3, LocalModel] | Rejected:
+def first_pose(query: Query, ranked: NDArray[np.int64]) -> tuple[Rigid3, LocalModel, list[int]] | Rejected:
+    """A pose by the matcher from a few references, else from more, with its points and the references they are from."""
+    found: tuple[Rigid3, LocalModel] | Rejected
+    found = Rejected(query.image.image_id, RejectReason.NO_CANDIDATES, "no reference image")
+    for count in sorted({query.search.config.first_count, query.search.config.count}):
+        indices = [int(i) for i in ranked[:count]]
+        found = _first_pose_of(query, indices)
+        if not isinstance(found, Rejected):
+            return (*found, indices)
+    return found
+
+
+def _first_pose_of(query: Query, indices: list[int]) -> tuple[Rigid3, LocalModel] | Rejected:
     matches = [matched(query, index) for index in indices]
     with query.timed("pose"):
         references = [query.reference.posed(i) for i in indices]

@@ -33,8 +33,8 @@ class Weakness:
     def text(self) -> str:
         axis = _AXES[int(np.argmax(np.abs(self.direction_in_cam)))]
         return (
-            f"position {axis} known to {self.sigma_m:.3g} m alone, {self.magnified:.0f} times what it would be were "
-            "the rotation known"
+            f"position {axis} known to {self.sigma_m:.3g} m by image noise alone, {self.magnified:.0f} times "
+            "what it would be were the rotation known"
         )
 
 

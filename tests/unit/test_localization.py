@@ -244,7 +244,8 @@ def test_geometry_that_does_not_fix_the_pose_is_rejected() -> None:
     assert largest_sigma(localized(localize(made, config=loose))) > 0.3
     outcome = rejected(localize(made, config=strict))
     assert outcome.reason == RejectReason.DEGENERATE
-    assert "over 0.3 m: position " in outcome.detail
+    assert "over 0.3 m: position up and down known to " in outcome.detail
+    assert "all on one plane, 50 m away" in outcome.detail
 
 
 def test_the_same_image_gives_the_same_pose_and_a_limit_thins_the_points() -> None:
