@@ -71,25 +71,19 @@ def _check(project: Project, survey: Survey) -> dict[str, Any]:
     return {"check points": _hash([_plain(p) for p in survey.check]), **_reference_files(project, survey)}
 
 
+_GUIDED_KEYS = ("localize.guided_gate", "localize.guided_min_similarity", "localize.guided_ratio")
 _NETWORK_KEYS = (
     "network",
-    "localize.guided_gate",
-    "localize.guided_min_similarity",
-    "localize.guided_ratio",
+    *_GUIDED_KEYS,
     "adjust.cauchy_scale",
     "adjust.gate_probability",
     "adjust.max_iterations",
 )
 
 _MAP_KEYS = ("matching", "global_map", "candidates.epochs")
-_TRACKS_KEYS = (
-    "tracks",
-    "localize.guided_gate",
-    "localize.guided_min_similarity",
-    "localize.guided_ratio",
-    "candidates.epochs",
-)
+_TRACKS_KEYS = ("tracks", *_GUIDED_KEYS, "candidates.epochs")
 _LOCALIZE_KEYS = ("matching", "candidates", "localize")
+_BEFORE_LOCALIZE = ("features", "network", "index", "global-map", "tracks")
 
 
 def _uses_index(config: Config) -> bool:
@@ -112,14 +106,7 @@ STAGES: tuple[Stage, ...] = (
         "global-map", 2, _MAP_KEYS, _reference_with_images, ("network",), global_map.run, _uses_map, of_reference=True
     ),
     Stage("tracks", 1, _TRACKS_KEYS, _reference_with_images, ("network",), tracks.run, _uses_tracks, of_reference=True),
-    Stage(
-        "localize",
-        4,
-        _LOCALIZE_KEYS,
-        _epoch_files,
-        ("features", "network", "index", "global-map", "tracks"),
-        localize.run,
-    ),
+    Stage("localize", 4, _LOCALIZE_KEYS, _epoch_files, _BEFORE_LOCALIZE, localize.run),
     Stage("adjust", 4, ("adjust", "localize", "matching"), _control, ("features", "network", "localize"), adjust.run),
     Stage("report", 2, ("report",), _check, ("features", "network", "localize", "adjust"), report.run),
 )
