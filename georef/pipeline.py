@@ -63,24 +63,17 @@ class Stage:
     results_exist: Callable[[StageContext], bool] | None = None  # where it is not known of the stage's name
 
 
+_GUIDED_KEYS = ("localize.guided_gate", "localize.guided_min_similarity", "localize.guided_ratio")
 _NETWORK_KEYS = (
     "network",
-    "localize.guided_gate",
-    "localize.guided_min_similarity",
-    "localize.guided_ratio",
+    *_GUIDED_KEYS,
     "adjust.cauchy_scale",
     "adjust.gate_probability",
     "adjust.max_iterations",
 )
 
 _MAP_KEYS = ("matching", "global_map", "candidates.epochs")
-_TRACKS_KEYS = (
-    "tracks",
-    "localize.guided_gate",
-    "localize.guided_min_similarity",
-    "localize.guided_ratio",
-    "candidates.epochs",
-)
+_TRACKS_KEYS = ("tracks", *_GUIDED_KEYS, "candidates.epochs")
 LOCALIZE_KEYS = ("matching", "candidates", "localize")
 _BEFORE_LOCALIZE = ("features", "network", "index", "global-map", "tracks")
 _STATION_KEYS = ("stations", "localize", "candidates.epochs")

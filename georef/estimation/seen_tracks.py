@@ -130,8 +130,8 @@ def local_model_of(
 def as_seen_from(model: LocalModel, world_from_cam: Rigid3, noise: ReferenceNoise) -> LocalModel:
     """The same points, intersected again: what sees them from another side than the query counts less.
 
-    From another side a keypoint sits on a slightly different spot of the same thing, and what is wanted is the spot
-    that the query shows. The observations come weighted for the angle to the nearest other ray of their point.
+    From another side a keypoint sits on a slightly different spot of the same thing; the spot that the query shows is
+    wanted. The observations come weighted for the angle to the nearest other ray of their point.
     """
     obs, centres = model.observations, model.views.centres
     to_query = model.points[obs.point] - world_from_cam.translation
