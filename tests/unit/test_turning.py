@@ -60,8 +60,10 @@ def test_features_of_a_turned_picture_are_of_the_image(quarter_turns: int, tmp_p
     places, size = mapped.as_found
     assert size == found.image_size
     np.testing.assert_allclose(places, found.keypoints_px, atol=1e-4)
-    assert mapped.orientations_as_found is not None
-    np.testing.assert_allclose(mapped.orientations_as_found, found.orientations_rad, atol=1e-6)
+    as_found, expected = mapped.orientations_as_found, found.orientations_rad
+    assert as_found is not None
+    assert expected is not None
+    np.testing.assert_allclose(as_found, expected, atol=1e-6)
     assert mapped.head(5).quarter_turns == quarter_turns
     source = tmp_path / "a.jpg"
     source.write_bytes(b"picture")
