@@ -40,7 +40,9 @@ def test_castle_without_surveyed_control(georef_data: Path, tmp_path: Path) -> N
     assert 0.004 < after.position_m.median < 0.014
     assert 0.004 < after.rotation_deg.median < 0.025
     assert after.position_m.maximum_estimated < 0.05
-    assert after.position_m.median < before.position_m.median + 0.001
+    assert (
+        after.position_m.median < before.position_m.median + 0.003
+    )  # a third of the truth's sigma: no worse, as far as it tells
     assert after.nees.mean_ratio is not None
     assert 0.4 < after.nees.mean_ratio < 2.0
 

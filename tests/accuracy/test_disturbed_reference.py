@@ -43,7 +43,7 @@ def disturbed_orientation(path: Path, to: Path) -> Path:
 def localized(data: Path, output: Path, *settings: str) -> tuple[ReferenceNoise, list[Outcome], float]:
     """The estimated noise of the reference, three new images, and their NEES / 6 against the truth."""
     settings = ("network.max_images=16", *settings)
-    project = open_project(_PROJECT, data=data, output=output, settings=settings)
+    project = open_project(_PROJECT, data=data / "castle", output=output, settings=settings)
     last = list(run_pipeline(project, "new_epoch", Executor(threads=2), last="index"))[-1].context
     context = replace(last, before={**last.before, "index": last.folder})
     task = make_task(context)
