@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from georef.estimation.first_pose import QueryImage
 from georef.estimation.local_model import LocalModel
+from georef.geometry.covariance import largest_position_sigma
 from georef.geometry.projection import Views, linearize
 from georef.geometry.rigid import Array, Rigid3
 from georef.types.results import ReferenceNoise
@@ -119,11 +120,6 @@ def most_informative(
     )
     order, sigma_m = _greedy(expectation, least, count)
     return Choice(useful[order], sigma_m)
-
-
-def largest_position_sigma(cov: Array) -> float:
-    """1-sigma of the position in the direction in which it is least certain, of a pose covariance (6, 6)."""
-    return float(np.sqrt(np.linalg.eigvalsh(cov[3:, 3:])[-1]))
 
 
 def _greedy(expectation: _Expectation, least: int, count: int) -> tuple[NDArray[np.int64], Array]:

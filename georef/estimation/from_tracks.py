@@ -57,7 +57,7 @@ def _found(query: Query, estimate: EstimatedPose, chosen: Sequence[int]) -> tupl
     structures = {index: query.reference.structure(index) for index in chosen}
     posed = {index: query.reference.posed(index) for index in chosen}
     seen = SeenTracks.of(structures, posed, estimate.world_from_cam, query.observed.camera)
-    options = GuidedOptions(query.config.guided_gate, query.config.guided_min_similarity, query.config.guided_ratio)
+    options = GuidedOptions.of(query.config)
     pairs = associate(seen, posed, query.posed, query.observed, estimate, options)
     return local_model_of(seen, structures, pairs, query.reference.views)
 

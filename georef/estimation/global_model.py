@@ -149,15 +149,13 @@ def _rows(structure: ImageStructure, reference: int, matches: Matches) -> NDArra
 
 def _gathered(points: Sequence[tuple[ImageStructure, int]]) -> Observations:
     """The observations of points of several structures, the points numbered in their order."""
-    empty = np.zeros(0, np.int64)
-    parts = [Observations(empty, empty, np.zeros((0, 2)), np.zeros(0), empty)]
+    parts = []
     for number, (structure, row) in enumerate(points):
         obs = structure.observations
         low, high = np.searchsorted(obs.point, [row, row + 1])
         own = obs.take(np.arange(low, high))
         parts.append(own.with_points(np.full(high - low, number)))
-    fields = ("point", "view", "pixel", "sigma_px", "keypoint")
-    return Observations(*(np.concatenate([getattr(part, name) for part in parts]) for name in fields))
+    return Observations.joined(parts)
 
 
 def _structure(

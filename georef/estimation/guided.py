@@ -12,6 +12,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from georef.config import LocalizeConfig
 from georef.features.nearest import similarity
 from georef.geometry.camera import Camera, ray_derivatives, rays_from_pixels
 from georef.geometry.rigid import Array, Rigid3, skew
@@ -72,6 +73,11 @@ class GuidedOptions:
     gate: float  # largest distance from the epipolar line, in keypoint scales
     min_similarity: float  # cosine of descriptors
     ratio: float  # best descriptor distance over the second best in the band
+
+    @staticmethod
+    def of(config: LocalizeConfig) -> GuidedOptions:
+        """As configured."""
+        return GuidedOptions(config.guided_gate, config.guided_min_similarity, config.guided_ratio)
 
     @property
     def least_rival(self) -> float:

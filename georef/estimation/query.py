@@ -18,6 +18,7 @@ from georef.estimation.timer import StepTimer
 from georef.estimation.weak_geometry import arrangement, weak_geometry, weakness
 from georef.features.base import Matcher
 from georef.geometry.camera import Camera
+from georef.geometry.covariance import largest_position_sigma
 from georef.geometry.rigid import Rigid3
 from georef.types.campaign import Image
 from georef.types.features import Features, Matches
@@ -85,7 +86,7 @@ def outcome_of(query: Query, estimate: EstimatedPose | None, model: LocalModel, 
     if not _enough(inliers, model, query.config):
         return Rejected(image_id, RejectReason.FEW_INLIERS, f"{inliers} of {len(model)} points agree with one pose")
     used = model.take(estimate.inliers)
-    sigma = float(np.sqrt(np.linalg.eigvalsh(estimate.cov[3:, 3:])[-1]))
+    sigma = largest_position_sigma(estimate.cov)
     if sigma > query.config.max_position_sigma_m:
         limit = query.config.max_position_sigma_m
         why = "; ".join([weakness(estimate.relative_cov).text, *arrangement(query.observed, used)])

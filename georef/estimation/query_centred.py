@@ -8,11 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from georef.estimation.agreement import Contradiction, Matched, contradiction
-from georef.estimation.expected import largest_position_sigma, most_informative
+from georef.estimation.expected import most_informative
 from georef.estimation.guided import GuidedOptions, guided_matches
 from georef.estimation.local_model import LocalModel, query_centred_model
 from georef.estimation.pnp import EstimatedPose, refine_pose
 from georef.estimation.query import Query, consensus, matched, outcome_of
+from georef.geometry.covariance import largest_position_sigma
 from georef.geometry.rigid import Array, Rigid3
 from georef.types.features import Matches
 from georef.types.results import Outcome, Rejected, RejectReason
@@ -167,6 +168,6 @@ def _in_order(query: Query, ranked: NDArray[np.int64], pose: Rigid3, model: Loca
 
 
 def _guided(query: Query, pose: Rigid3, index: int) -> Matches:
-    options = GuidedOptions(query.config.guided_gate, query.config.guided_min_similarity, query.config.guided_ratio)
+    options = GuidedOptions.of(query.config)
     known = query.pairs.get(index)
     return guided_matches(query.posed.posed(pose), query.reference.posed(index), options, known)

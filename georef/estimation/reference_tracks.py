@@ -182,11 +182,10 @@ def _spread_px(views: Views, observations: Observations, points: Array, pose_cov
 def _concatenated(parts: Sequence[Tracks]) -> Tracks:
     offset = np.cumsum([0, *(len(part) for part in parts)])
     obs = [p.observations.with_points(p.observations.point + o) for p, o in zip(parts, offset, strict=False)]
-    fields = ("point", "view", "pixel", "sigma_px", "keypoint")
     return Tracks(
         np.concatenate([p.points for p in parts]),
         np.concatenate([p.cov for p in parts]),
-        Observations(*(np.concatenate([getattr(o, name) for o in obs]) for name in fields)),
+        Observations.joined(obs),
     )
 
 

@@ -116,10 +116,7 @@ def local_model_of(
         place[source[here, 1]] = here
         kept = obs.take(place[obs.point] >= 0)
         parts.append(kept.with_points(place[kept.point]))
-    none = np.zeros(0, np.int64)
-    parts = parts or [Observations(none, none, np.zeros((0, 2)), np.zeros(0), none)]
-    fields = ("point", "view", "pixel", "sigma_px", "keypoint")
-    observations = Observations(*(np.concatenate([getattr(part, name) for part in parts]) for name in fields))
+    observations = Observations.joined(parts)
     names, view = np.unique(observations.view, return_inverse=True)
     numbered = replace(observations, view=view.astype(np.int64))
     chosen = [int(name) for name in names]

@@ -29,7 +29,7 @@ def second_chance(
 ) -> tuple[ReferenceMatches, ...]:
     """Matches along the epipolar lines of the pose that the station gives an image, with the nearest references."""
     pose = world_from_rig @ image.mounting.rig_from_cam
-    options = GuidedOptions(config.guided_gate, config.guided_min_similarity, config.guided_ratio)
+    options = GuidedOptions.of(config)
     found = []
     for index in _references_near(pose, reference, count):
         matches = guided_matches(image.features.posed(pose), reference.posed(index), options)

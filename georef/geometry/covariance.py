@@ -18,6 +18,11 @@ def symmetric(matrix: Array) -> Array:
     return 0.5 * (matrix + np.swapaxes(matrix, -1, -2))
 
 
+def largest_position_sigma(cov: Array) -> float:
+    """1-sigma of the position in the direction in which it is least certain, of a pose covariance (6, 6)."""
+    return float(np.sqrt(np.linalg.eigvalsh(cov[3:, 3:])[-1]))
+
+
 def upper_triangle(cov: Array) -> Array:
     """The 21 upper-triangle elements of a (6, 6) covariance, row by row."""
     return cov[np.triu_indices(6)]

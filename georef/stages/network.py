@@ -46,9 +46,7 @@ def run(context: StageContext) -> StageSummary:
         PosedFeatures.of(store.read(feature_id(image), config.network.max_keypoints), image.camera, _pose(image))
         for image in chosen
     ]
-    options = GuidedOptions(
-        config.localize.guided_gate, config.localize.guided_min_similarity, config.localize.guided_ratio
-    )
+    options = GuidedOptions.of(config.localize)
     matches = match_network(posed, config.network.neighbours, options, context.executor.progress)
     result = estimate_noise(posed, matches, config.network, config.adjust, declared_noise(chosen))
     suspects = [chosen[i].image_id for i in result.suspects]

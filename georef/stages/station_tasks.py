@@ -100,7 +100,7 @@ class TieTask:
 
     def __call__(self, pair: tuple[Image, Image]) -> tuple[Pair, NDArray[np.int32]]:
         config = self.stations.localize.config.localize
-        options = GuidedOptions(config.guided_gate, config.guided_min_similarity, config.guided_ratio)
+        options = GuidedOptions.of(config)
         a, b = (self.stations.posed(image) for image in pair)
         return (pair[0].image_id, pair[1].image_id), guided_matches(a, b, options).indices
 

@@ -13,7 +13,6 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from georef.config import LocalizeConfig
 from georef.errors import StageError
 from georef.estimation.global_model import Pair, choose_pairs
 from georef.estimation.guided import GuidedOptions, PosedFeatures, guided_matches
@@ -42,7 +41,7 @@ class MatchTask(MapTask):
         found = self._kept(index, keys)
         missing = [other for other in keys if other not in found]
         posed = self.posed([index, *missing]) if missing else {}
-        options = guided_options(self.localize.config.localize)
+        options = GuidedOptions.of(self.localize.config.localize)
         for other in missing:
             if index in posed and other in posed:
                 try:
@@ -69,7 +68,7 @@ class MatchTask(MapTask):
         return found
 
     def _key(self, a: int, b: int) -> str:
-        return _digest([self.states[a], self.states[b], asdict(guided_options(self.localize.config.localize))])
+        return _digest([self.states[a], self.states[b], asdict(GuidedOptions.of(self.localize.config.localize))])
 
 
 @dataclass
@@ -95,10 +94,6 @@ def run(context: StageContext) -> StageSummary:
     match = MatchTask(make_task(context), context.folder, ids, pairs, earlier, states)
     tracks = TrackTask(make_task(context), context.folder, ids, pairs)
     return summary_of(tracks, map_references(context, match, tracks, config.block_images))
-
-
-def guided_options(config: LocalizeConfig) -> GuidedOptions:
-    return GuidedOptions(config.guided_gate, config.guided_min_similarity, config.guided_ratio)
 
 
 def _state(context: StageContext, image: Image) -> str:

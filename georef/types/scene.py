@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -25,6 +26,14 @@ class Observations:
 
     def __len__(self) -> int:
         return len(self.point)
+
+    @staticmethod
+    def joined(parts: Iterable[Observations]) -> Observations:
+        """All observations of any number of parts, in their order."""
+        none = np.zeros(0, np.int64)
+        every = [Observations(none, none, np.zeros((0, 2)), np.zeros(0), none), *parts]
+        fields = ("point", "view", "pixel", "sigma_px", "keypoint")
+        return Observations(*(np.concatenate([getattr(part, name) for part in every]) for name in fields))
 
     def take(self, selection: NDArray[np.bool_] | NDArray[np.integer]) -> Observations:
         return Observations(

@@ -5,12 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from georef.estimation.expected import Choice, largest_position_sigma, most_informative
+from georef.estimation.expected import Choice, most_informative
 from georef.estimation.first_pose import QueryImage
 from georef.estimation.guided import PosedFeatures
 from georef.estimation.local_model import LocalModel, query_centred_model
 from georef.estimation.pnp import refine_pose
 from georef.estimation.reference_errors import ReferenceErrors
+from georef.geometry.covariance import largest_position_sigma
 from georef.geometry.projection import Views
 from georef.geometry.rigid import Array, Rigid3, exp_so3
 from georef.types.results import ReferenceNoise
