@@ -87,12 +87,12 @@ def _initial_values(problem: Problem, images: int, points: int) -> gtsam.Values:
         values.insert(index, _pose3(pose))
     for index, point in enumerate(problem.points):
         values.insert(images + index, point)
-    for index, position in enumerate(_control_start(problem)):
+    for index, position in enumerate(control_start(problem)):
         values.insert(images + points + index, position)
     return values
 
 
-def _control_start(problem: Problem) -> Array:
+def control_start(problem: Problem) -> Array:
     """Where control points (C, 3) start: intersected from their marks, so that a robust loss can tell wrong coordinates
     from wrong marks; at their coordinates where the marks do not say."""
     marks, given = control_observations(problem), np.array([c.point_in_world for c in problem.control]).reshape(-1, 3)
