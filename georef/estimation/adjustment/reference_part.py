@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 from scipy.sparse import coo_array, csr_array
@@ -41,9 +41,10 @@ class ReferencePart:
 
     def cov(self, found: Cofactors, derivatives: Array) -> Array:
         """What the references add to the covariance (K, K) of K values with derivatives (U, K) by the unknowns."""
-        if not self.by_reference.shape[1]:
+        if not len(self.errors):
             return np.zeros((derivatives.shape[1], derivatives.shape[1]))
-        gains = cast(Any, self.by_reference.T @ found.apply(derivatives)).reshape(-1, 6, derivatives.shape[1])
+        from_references: Any = self.by_reference.T
+        gains = (from_references @ found.apply(derivatives)).reshape(-1, 6, derivatives.shape[1])
         return self.errors.propagated(np.swapaxes(gains, 1, 2))
 
 
