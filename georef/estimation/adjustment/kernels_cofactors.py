@@ -14,18 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from georef.estimation.adjustment.kernels import kernel
-from georef.estimation.adjustment.kernels_eliminate import keep_point
-from georef.estimation.adjustment.kernels_points import (
-    add_prior,
-    invert_root,
-    linearize_track,
-    point_normal,
-    sum_stations,
-)
+from georef.estimation.adjustment.kernels_points import BATCH, keep, linearize, point_normals, share, sum_stations
 from georef.geometry.rigid import Array
 
 RANK_TOLERANCE = 0.05
 """Eigenvalues of a whitened cofactor of residuals below this are directions that nothing checks."""
+_OPEN = 1e-12  # of the cubed trace: the determinant of the normal matrix of a point with an open direction
 
 
 class Inverse(NamedTuple):
@@ -70,113 +64,147 @@ def scratch_for(longest: int, border: int) -> Scratch:
 @kernel
 def test_observations(tracks, images, placed, points, information, shift, inverse, tested, work, scratch):
     """Fills `tested`. points (P, 3); information (K, 3, 3) and its products with given positions of point priors."""
-    shared = inverse.border.shape[0] > 0
-    for track in range(tracks.point.shape[0]):
-        point, kept, used = tracks.point[track], tracks.kept[track], 0
-        slots, _, _ = linearize_track(tracks, track, images, placed, points[point], 0.0, shared, work)
-        count = tracks.start[track + 1] - tracks.start[track]
-        if kept >= 0:
-            keep_point(count, kept, placed, work)
-            tested.point[point] = inverse.border[kept : kept + 3, kept : kept + 3]
-        else:
-            sum_stations(count, slots, work)
-            point_normal(slots, placed, work)
-            if tracks.prior[track] >= 0:
-                add_prior(information[tracks.prior[track]], shift[tracks.prior[track]], points[point], work)
-            loose = invert_root(work.normal, 0.0, work.root)
-            used = _gains(count, slots, placed, shared, work, scratch)
-            _propagate(slots, used, inverse, work, scratch)
-            tested.point[point] = scratch.whole
-            if loose:
-                tested.point[point] = np.nan
-        for o in range(count):
-            at = tracks.start[track] + o
-            if work.slot[o] < 0:
-                tested.statistic[at], tested.rank[at], tested.redundancy[at] = np.nan, -1, 0.0
-                continue
-            _adjusted(o, kept >= 0, shared, placed, inverse, work, scratch)
-            r, c = work.residual[o], scratch.cov
-            statistic, rank = _test(r[0], r[1], 1.0 - c[0, 0], -0.5 * (c[0, 1] + c[1, 0]), 1.0 - c[1, 1])
-            tested.statistic[at], tested.rank[at] = statistic, rank
-            tested.redundancy[at] = 2.0 - c[0, 0] - c[1, 1]
-        if kept < 0:
+    rays, slots, shared = work.rays, work.slots, work.shared
+    border = inverse.border.shape[0] > 0
+    for begin in range(0, tracks.point.shape[0], BATCH):
+        end = min(begin + BATCH, tracks.point.shape[0])
+        linearize(tracks, begin, end, images, placed, points, 0.0, rays, slots)
+        sum_stations(tracks.start[end] - tracks.start[begin], slots.first[end - begin], rays, slots)
+        point_normals(tracks, begin, end, placed, points, information, shift, 0.0, slots)
+        if border:
+            share(tracks, begin, end, images, placed, rays)
+            keep(tracks, begin, end, placed, rays, slots)
+        for track in range(begin, end):
+            p, kept = track - begin, tracks.kept[track] >= 0
+            o, last = tracks.start[track] - tracks.start[begin], tracks.start[track + 1] - tracks.start[begin]
+            used = 0 if kept else _gains(p, o, last, placed, border, rays, slots, shared, scratch)
+            if not kept:
+                _propagate(slots.first[p], slots.first[p + 1], used, inverse, slots, shared, scratch)
+            _keep_point_cofactor(tracks, track, kept, slots.normal, p, inverse, scratch, tested)
+            for at in range(tracks.start[track], tracks.start[track + 1]):
+                _test_one(
+                    at, at - tracks.start[begin], p, kept, border, placed, inverse, rays, slots, shared, scratch, tested
+                )
             for a in range(used):
-                work.place[work.used[a]] = -1
+                shared.place[shared.used[a]] = -1
 
 
 @kernel
-def _gains(count, slots, placed, shared, work, scratch):
-    """N^-1 and H' of the point's stations and border unknowns; how many the latter are."""
-    root, own = work.root, scratch.own
+def _keep_point_cofactor(tracks, track, kept, normal, p, inverse, scratch, tested):
+    """The point's own cofactor; NaN where its rays leave a direction open."""
+    point = tracks.point[track]
+    determinant = (
+        normal[p, 0, 0] * (normal[p, 1, 1] * normal[p, 2, 2] - normal[p, 1, 2] * normal[p, 2, 1])
+        - normal[p, 0, 1] * (normal[p, 1, 0] * normal[p, 2, 2] - normal[p, 1, 2] * normal[p, 2, 0])
+        + normal[p, 0, 2] * (normal[p, 1, 0] * normal[p, 2, 1] - normal[p, 1, 1] * normal[p, 2, 0])
+    )
+    trace = normal[p, 0, 0] + normal[p, 1, 1] + normal[p, 2, 2]
+    loose = not determinant > _OPEN * trace * trace * trace
     for i in range(3):
         for j in range(3):
-            own[i, j] = root[0, i] * root[0, j] + root[1, i] * root[1, j] + root[2, i] * root[2, j]
-    for s in range(slots):
-        m, q, h = work.mixed[s], work.q[s], scratch.h[s]
+            if kept:
+                tested.point[point, i, j] = inverse.border[tracks.kept[track] + i, tracks.kept[track] + j]
+            else:
+                tested.point[point, i, j] = np.nan if loose else scratch.whole[i, j]
+
+
+@kernel
+def _test_one(at, o, p, kept, border, placed, inverse, rays, slots, shared, scratch, tested):
+    """Tests observation `at`, the batch's o-th, of its p-th point."""
+    if rays.slot[o] < 0:
+        tested.statistic[at], tested.rank[at], tested.redundancy[at] = np.nan, -1, 0.0
+        return
+    _adjusted(o, slots.first[p], kept, border, placed, inverse, rays, slots, shared, scratch)
+    c = scratch.cov
+    u, v = rays.residual[o, 0], rays.residual[o, 1]
+    statistic, rank = _test(u, v, 1.0 - c[0, 0], -0.5 * (c[0, 1] + c[1, 0]), 1.0 - c[1, 1])
+    tested.statistic[at], tested.rank[at] = statistic, rank
+    tested.redundancy[at] = 2.0 - c[0, 0] - c[1, 1]
+
+
+@kernel
+def _gains(p, begin, end, placed, border, rays, slots, shared, scratch):
+    """N^-1 and H' of a point's stations and border unknowns; how many the latter are."""
+    own, h, root = scratch.own, scratch.h, slots.root
+    for i in range(3):
         for j in range(3):
-            a = m[0, 0] * own[0, j] + m[0, 1] * own[1, j] + m[0, 2] * own[2, j]
-            b = m[1, 0] * own[0, j] + m[1, 1] * own[1, j] + m[1, 2] * own[2, j]
-            c = m[2, 0] * own[0, j] + m[2, 1] * own[1, j] + m[2, 2] * own[2, j]
-            h[0, j], h[1, j], h[2, j] = q[2] * b - q[1] * c, q[0] * c - q[2] * a, q[1] * a - q[0] * b
-            h[3, j], h[4, j], h[5, j] = -a, -b, -c
+            total = 0.0
+            for k in range(max(i, j), 3):
+                total += root[p, k, i] * root[p, k, j]
+            own[i, j] = total
+    for s in range(slots.first[p], slots.first[p + 1]):
+        at, x, y, z = s - slots.first[p], slots.q[s, 0], slots.q[s, 1], slots.q[s, 2]
+        for j in range(3):
+            a, b, c = 0.0, 0.0, 0.0
+            for k in range(3):
+                a += slots.mixed[s, 0, k] * own[k, j]
+                b += slots.mixed[s, 1, k] * own[k, j]
+                c += slots.mixed[s, 2, k] * own[k, j]
+            h[at, 0, j], h[at, 1, j], h[at, 2, j] = z * b - y * c, x * c - z * a, y * a - x * b
+            h[at, 3, j], h[at, 4, j], h[at, 5, j] = -a, -b, -c
     used = 0
-    if not shared:
+    if not border:
         return used
-    for o in range(count):
-        if work.slot[o] < 0:
+    for o in range(begin, end):
+        if rays.slot[o] < 0:
             continue
-        _by_point(o, placed, work, scratch)
-        d, c = scratch.by_point, work.shared[o]
-        for a in range(work.columns[o]):
-            at = work.column[o, a]
-            if work.place[at] < 0:
-                work.place[at], work.used[used] = used, at
-                scratch.h_border[used, :] = 0.0
+        _by_point(o, placed, rays, slots, scratch)
+        for a in range(rays.columns[o]):
+            at = rays.column[o, a]
+            if shared.place[at] < 0:
+                shared.place[at], shared.used[used] = used, at
+                for j in range(3):
+                    scratch.h_border[used, j] = 0.0
                 used += 1
-            h = scratch.h_border[work.place[at]]
-            for j in range(3):
-                for k in range(3):
-                    h[j] += (c[0, a] * d[0, k] + c[1, a] * d[1, k]) * own[k, j]
+            place = shared.place[at]
+            for k in range(3):
+                w = rays.shared[o, 0, a] * scratch.by_point[0, k] + rays.shared[o, 1, a] * scratch.by_point[1, k]
+                for j in range(3):
+                    scratch.h_border[place, j] += w * own[k, j]
     return used
 
 
 @kernel
-def _by_point(o, placed, work, scratch):
+def _by_point(o, placed, rays, slots, scratch):
     """G R (2, 3), the derivative of an observation by its point."""
-    g, r = work.by_rig[o], placed.rig_rotation[work.station[work.slot[o]]]
+    station = slots.station[rays.slot[o]]
     for i in range(2):
         for j in range(3):
-            scratch.by_point[i, j] = g[i, 0] * r[0, j] + g[i, 1] * r[1, j] + g[i, 2] * r[2, j]
+            total = 0.0
+            for k in range(3):
+                total += rays.by_rig[o, i, k] * placed.rig_rotation[station, k, j]
+            scratch.by_point[i, j] = total
 
 
 @kernel
-def _propagate(slots, used, inverse, work, scratch):
-    """Q H' of the point's stations and border unknowns, and N^-1 + H Q H'."""
+def _propagate(begin, end, used, inverse, slots, shared, scratch):
+    """Q H' of a point's stations (slots begin to end) and border unknowns, and N^-1 + H Q H'."""
     h, qh, hb, qhb = scratch.h, scratch.qh, scratch.h_border, scratch.qh_border
-    qh[:slots] = 0.0
+    count = end - begin
+    qh[:count] = 0.0
     qhb[:used] = 0.0
-    for s in range(slots):
-        entry = inverse.first[work.station[s]]
-        for other in range(s, slots):
-            while inverse.column[entry] != work.station[other]:
+    for s in range(count):
+        station = slots.station[begin + s]
+        entry = inverse.first[station]
+        for other in range(s, count):
+            while inverse.column[entry] != slots.station[begin + other]:
                 entry += 1
-            _add_pair(inverse.pair[entry], s, other, h, qh)
-        edge = inverse.station_border[work.station[s]]
+            _add_pair(inverse.pair, entry, s, other, h, qh)
         for i in range(6):
             for a in range(used):
-                q = edge[i, work.used[a]]
+                q = inverse.station_border[station, i, shared.used[a]]
                 for j in range(3):
                     qh[s, i, j] += q * hb[a, j]
                     qhb[a, j] += q * h[s, i, j]
     for a in range(used):
         for b in range(used):
-            q = inverse.border[work.used[a], work.used[b]]
+            q = inverse.border[shared.used[a], shared.used[b]]
             for j in range(3):
                 qhb[a, j] += q * hb[b, j]
     for i in range(3):
         for j in range(3):
             total = scratch.own[i, j]
-            for s in range(slots):
+            for s in range(count):
                 for k in range(6):
                     total += h[s, k, i] * qh[s, k, j]
             for a in range(used):
@@ -185,71 +213,72 @@ def _propagate(slots, used, inverse, work, scratch):
 
 
 @kernel
-def _add_pair(q, s, other, h, qh):
+def _add_pair(pair, entry, s, other, h, qh):
     for i in range(6):
         for j in range(6):
+            q = pair[entry, i, j]
             for k in range(3):
-                qh[s, i, k] += q[i, j] * h[other, j, k]
+                qh[s, i, k] += q * h[other, j, k]
                 if other != s:
-                    qh[other, j, k] += q[i, j] * h[s, i, k]
+                    qh[other, j, k] += q * h[s, i, k]
 
 
 @kernel
-def _adjusted(o, kept, shared, placed, inverse, work, scratch):
-    """The cofactor (2, 2) of an adjusted image observation, whitened."""
-    s, cov, by = work.slot[o], scratch.cov, scratch.by_station
-    g, x, y, z = work.by_rig[o], work.q[s, 0], work.q[s, 1], work.q[s, 2]
+def _adjusted(o, first, kept, border, placed, inverse, rays, slots, shared, scratch):
+    """The cofactor (2, 2) of an adjusted image observation, whitened; first: slot of its point's first station."""
+    s, cov, by = rays.slot[o], scratch.cov, scratch.by_station
+    x, y, z = slots.q[s, 0], slots.q[s, 1], slots.q[s, 2]
     for i in range(2):
-        a, b, c = g[i, 0], g[i, 1], g[i, 2]
+        a, b, c = rays.by_rig[o, i, 0], rays.by_rig[o, i, 1], rays.by_rig[o, i, 2]
         by[i, 0], by[i, 1], by[i, 2] = b * z - c * y, c * x - a * z, a * y - b * x
         by[i, 3], by[i, 4], by[i, 5] = -a, -b, -c
-    station = work.station[s]
-    own = inverse.pair[inverse.first[station]]
+    station = slots.station[s]
+    own = inverse.first[station]
     for i in range(2):
         for j in range(2):
             total = 0.0
             for k in range(6):
                 for m in range(6):
-                    total += by[i, k] * own[k, m] * by[j, m]
+                    total += by[i, k] * inverse.pair[own, k, m] * by[j, m]
             cov[i, j] = total
-    if shared:
-        _add_shared(o, station, inverse, work, scratch)
+    if border:
+        _add_shared(o, station, inverse, rays, scratch)
     if kept:
         return
-    _by_point(o, placed, work, scratch)
-    d, whole, qh, qhb = scratch.by_point, scratch.whole, scratch.qh[s], scratch.qh_border
+    _by_point(o, placed, rays, slots, scratch)
+    d, whole, qh, qhb = scratch.by_point, scratch.whole, scratch.qh, scratch.qh_border
     for i in range(2):
         for k in range(3):
-            across = 0.0
+            across, point = 0.0, 0.0
             for m in range(6):
-                across += by[i, m] * qh[m, k]
-            if shared:
-                for a in range(work.columns[o]):
-                    across += work.shared[o, i, a] * qhb[work.place[work.column[o, a]], k]
+                across += by[i, m] * qh[s - first, m, k]
+            if border:
+                for a in range(rays.columns[o]):
+                    across += rays.shared[o, i, a] * qhb[shared.place[rays.column[o, a]], k]
+            for m in range(3):
+                point += d[i, m] * whole[m, k]
             for j in range(2):
-                cov[i, j] -= across * d[j, k]
+                cov[i, j] += (point - across) * d[j, k]
                 cov[j, i] -= across * d[j, k]
-                for m in range(3):
-                    cov[i, j] += d[i, k] * whole[k, m] * d[j, m]
 
 
 @kernel
-def _add_shared(o, station, inverse, work, scratch):
-    by, cov, c = scratch.by_station, scratch.cov, work.shared[o]
-    for a in range(work.columns[o]):
-        at = work.column[o, a]
+def _add_shared(o, station, inverse, rays, scratch):
+    by, cov = scratch.by_station, scratch.cov
+    for a in range(rays.columns[o]):
+        at = rays.column[o, a]
         for j in range(2):
             across = 0.0
             for m in range(6):
                 across += by[j, m] * inverse.station_border[station, m, at]
             for i in range(2):
-                cov[i, j] += c[i, a] * across
-                cov[j, i] += c[i, a] * across
-        for b in range(work.columns[o]):
-            q = inverse.border[at, work.column[o, b]]
+                cov[i, j] += rays.shared[o, i, a] * across
+                cov[j, i] += rays.shared[o, i, a] * across
+        for b in range(rays.columns[o]):
+            q = inverse.border[at, rays.column[o, b]]
             for i in range(2):
                 for j in range(2):
-                    cov[i, j] += c[i, a] * q * c[j, b]
+                    cov[i, j] += rays.shared[o, i, a] * q * rays.shared[o, j, b]
 
 
 @kernel
