@@ -7,7 +7,7 @@ a robust loss does not see through a stretch whose neighbours confirm each other
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -15,8 +15,8 @@ from georef.errors import GeorefError
 from georef.estimation.adjustment.block import KINDS_OF_POINT, Block, State
 from georef.estimation.adjustment.block_cholesky import SingularMatrix
 from georef.estimation.adjustment.block_gates import RejectedConstraint, without_contradictions
-from georef.estimation.adjustment.coherent import CoherentBlock, CoherentSearch, coherent_blocks
 from georef.estimation.adjustment.cofactors import Cofactors, cofactors
+from georef.estimation.adjustment.coherent import CoherentBlock, CoherentSearch, coherent_blocks
 from georef.estimation.adjustment.components import Component
 from georef.estimation.adjustment.constraint_terms import DISTANCES, POSE_PRIORS, POSITION_PRIORS, RELATIVE_POSES
 from georef.estimation.adjustment.datum import explain_singular
@@ -42,13 +42,13 @@ class BlockOptions:
     losses: Mapping[str, float]
     gate_probability: float = 0.999
     reference_m: float = 0.01
-    solver: SolverOptions = SolverOptions()
+    solver: SolverOptions = field(default_factory=SolverOptions)
 
     @staticmethod
-    def of(cauchy_scale: float, **others: float) -> BlockOptions:
-        """One scale for all kinds; others: gate_probability, reference_m."""
+    def of(cauchy_scale: float, gate_probability: float = 0.999) -> BlockOptions:
+        """One scale for all kinds."""
         kinds = (IMAGE_OBSERVATIONS, POSE_PRIORS, POSITION_PRIORS, RELATIVE_POSES, DISTANCES, *KINDS_OF_POINT)
-        return BlockOptions(dict.fromkeys(kinds, cauchy_scale), **others)
+        return BlockOptions(dict.fromkeys(kinds, cauchy_scale), gate_probability)
 
 
 @dataclass(frozen=True, eq=False)

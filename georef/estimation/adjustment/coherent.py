@@ -8,6 +8,7 @@ together, so that an overlap or a good piece inside a run comes out right.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -107,8 +108,7 @@ def _wrong_pieces(
     """Pieces between the ends of runs whose own shift stays significant when those of all others are estimated along;
     what was good inside a run is let go, least significant first."""
     cuts = sorted({end for run in runs for end in run})
-    covered = _design(runs, len(system)).any(axis=1)
-    pieces = [piece for piece in zip(cuts[:-1], cuts[1:], strict=True) if covered[piece[0] : piece[1]].all()]
+    pieces = [(a, b) for a, b in pairwise(cuts) if any(begin <= a and b <= end for begin, end in runs)]
     while pieces:
         shifts, cov, _ = system.estimate(_design(pieces, len(system)))
         statistic = np.array([_squared(s, _own(cov, k, k) + shared * np.eye(3)) for k, s in enumerate(shifts)])
@@ -132,8 +132,8 @@ def _joined(system: ShiftSystem, pieces: list[tuple[int, int]], limit: float) ->
 
 
 def _undecidable(system: ShiftSystem, pieces: list[tuple[int, int]], shifts: Array, cov: Array, limit: float) -> bool:
-    """Whether some pieces of one shift may as well be right and all unnamed priors wrong: that explains the residuals as
-    well, and there are not many more of the latter."""
+    """Whether some pieces of one shift may as well be right and all unnamed priors wrong: that explains the residuals
+    no worse, and there are not many more of the latter."""
     design, per_segment = _design(pieces, len(system)), np.bincount(system.segment, minlength=len(system))
     rest = ~design.any(axis=1)
     explained = system.estimate(design)[2]

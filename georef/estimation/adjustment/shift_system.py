@@ -42,7 +42,7 @@ class ShiftSystem:
         """Shifts (k, 3) common to sets of segments, their joint covariance (3 k, 3 k), and by how much they lower the
         squared residuals. design: (n, k), 1 where a segment belongs to a set."""
         wide = np.kron(design, np.eye(3))
-        cov = np.linalg.pinv(wide.T @ self.information @ wide, rcond=1e-10, hermitian=True)
+        cov = cast(Array, np.linalg.pinv(wide.T @ self.information @ wide, rcond=1e-10, hermitian=True))
         right = wide.T @ self.right
         shifts = cov @ right
         return shifts.reshape(-1, 3), cov, float(right @ shifts)
