@@ -101,7 +101,7 @@ def total_cost(
     losses, prepared = losses or {}, prepared or Prepared.of(block)
     scale = losses.get(IMAGE_OBSERVATIONS, 0.0)
     cost, hidden = all_cost(
-        *(prepared.tracks, prepared.images, placed(state), state.points, scale, hidden_square, prepared.work())
+        *(prepared.tracks, prepared.images, placed(state), state.points, scale, hidden_square)
     )
     return float(cost) + constraint_cost(block, state, prepared.layout, losses), int(hidden)
 

@@ -63,8 +63,7 @@ class Prepared:
         return Prepared(layout, tracks, _images(block, layout), order, first, column)
 
     def work(self) -> Work:
-        longest = int(np.diff(self.tracks.start).max(initial=0))
-        return work_for(longest, 6 + self.images.code.shape[1] + 3, self.layout.border)
+        return work_for(self.tracks.start, 6 + self.images.code.shape[1] + 3, self.layout.border)
 
 
 def placed(state: State) -> Placed:

@@ -1,0 +1,177 @@
+"""The adjustment of a block against blunders: Cauchy, gates, refit without a robust loss, quality.
+
+Every kind of observation has its own loss and gate. Coherent blocks of wrong poses are looked for before single ones:
+a robust loss does not see through a stretch whose neighbours confirm each other.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from georef.errors import GeorefError
+from georef.estimation.adjustment.block import KINDS_OF_POINT, Block, State
+from georef.estimation.adjustment.block_cholesky import SingularMatrix
+from georef.estimation.adjustment.block_gates import RejectedConstraint, without_contradictions
+from georef.estimation.adjustment.cofactors import Cofactors, cofactors
+from georef.estimation.adjustment.coherent import CoherentBlock, CoherentSearch, coherent_blocks
+from georef.estimation.adjustment.components import Component
+from georef.estimation.adjustment.constraint_terms import DISTANCES, POSE_PRIORS, POSITION_PRIORS, RELATIVE_POSES
+from georef.estimation.adjustment.datum import explain_singular
+from georef.estimation.adjustment.eliminate import IMAGE_OBSERVATIONS, normal_equations
+from georef.estimation.adjustment.group_tests import ImageTests, TermTests, components, constraint_tests, image_tests
+from georef.estimation.adjustment.prepared import Prepared
+from georef.estimation.adjustment.shift_system import pose_shifts
+from georef.estimation.adjustment.solver import BlockSolution, SolverOptions, solve_block
+from georef.geometry.rigid import Array
+
+_GATE_ROUNDS, _ROBUST_ROUNDS = 3, 2
+_FAR_OFF = 1.25  # of a sigma against its residuals
+_SETTLED_SHARE = 1e-4  # of the observations: a gate that drops fewer changes nothing
+_FACTOR_TOLERANCE = 0.05
+_GROSS = 1e-3  # share of the false alarms of a gate that the first one may give: a robust solution is not the best one
+
+
+@dataclass(frozen=True)
+class BlockOptions:
+    """losses: scale in sigmas of the Cauchy loss of each kind. gate_probability: what good observations pass with.
+    reference_m: 1-sigma of the errors that right poses of a stretch may share."""
+
+    losses: Mapping[str, float]
+    gate_probability: float = 0.999
+    reference_m: float = 0.01
+    solver: SolverOptions = field(default_factory=SolverOptions)
+
+    @staticmethod
+    def of(cauchy_scale: float, gate_probability: float = 0.999) -> BlockOptions:
+        """One scale for all kinds."""
+        kinds = (IMAGE_OBSERVATIONS, POSE_PRIORS, POSITION_PRIORS, RELATIVE_POSES, DISTANCES, *KINDS_OF_POINT)
+        return BlockOptions(dict.fromkeys(kinds, cauchy_scale), gate_probability)
+
+
+@dataclass(frozen=True, eq=False)
+class Quality:
+    """Cofactors and tests of a block at a state. gradient (6 S + B,): of the reduced normal equations there."""
+
+    cofactors: Cofactors
+    gradient: Array
+    images: ImageTests
+    constraints: list[TermTests]
+    components: dict[str, Component]
+
+
+@dataclass(frozen=True, eq=False)
+class AdjustedBlock:
+    """A block that passed its gates, its solution and its quality.
+
+    sigma_scale: of the image observations, against the block as it was given; dropped: how many of them were. wrong:
+    coherent blocks of poses; undecidable: which of their sides is wrong, nothing but their number tells.
+    """
+
+    block: Block
+    solution: BlockSolution
+    quality: Quality
+    rejected: tuple[RejectedConstraint, ...]
+    wrong: tuple[CoherentBlock, ...]
+    undecidable: bool
+    dropped: int
+    sigma_scale: float
+
+
+def adjust_block(block: Block, options: BlockOptions) -> AdjustedBlock:
+    """Adjusts a block in which observations and constraints may be wrong.
+
+    Image sigmas are scaled by their own variance component; sigmas of constraints are tested and reported, never
+    changed. Raises GeorefError where the constraints leave the datum open.
+    """
+    given, gross = block, 1.0 - _GROSS * (1.0 - options.gate_probability)
+    block, state, scale = _robust(block, block.start(), options)
+    block, _ = _gate_images(block, state, quality(block, state), gross)
+    search = _coherent(block, state, options)
+    if search.blocks:
+        block = _without_rows(block, search)
+        state = solve_block(block, losses=options.losses, options=options.solver, start=state).state
+    block, rejected = without_contradictions(block, quality(block, state).constraints, gross)
+    solution = solve_block(block, options=options.solver, start=state)
+    block, solution, scale = _rescaled(block, solution, scale, options)
+    for _ in range(_GATE_ROUNDS):
+        found = quality(block, solution.state)
+        kept, more = without_contradictions(block, found.constraints, options.gate_probability)
+        kept, dropped = _gate_images(kept, solution.state, found, options.gate_probability)
+        if not more and dropped <= _SETTLED_SHARE * len(given.observations):
+            break
+        block, rejected = kept, rejected + more
+        solution = solve_block(block, options=options.solver, start=solution.state)
+    block, solution, scale = _rescaled(block, solution, scale, options)
+    dropped = len(given.observations) - len(block.observations)
+    found = quality(block, solution.state)
+    return AdjustedBlock(block, solution, found, rejected, search.blocks, search.undecidable, dropped, scale)
+
+
+def quality(block: Block, state: State) -> Quality:
+    """Cofactors, tests and variance components at a state, for the stated sigmas. Raises GeorefError."""
+    prepared = Prepared.of(block)
+    lin = normal_equations(block, state, prepared=prepared)
+    try:
+        found = cofactors(lin.reduced)
+    except SingularMatrix:
+        words = explain_singular(block, state, lin.reduced)
+        raise GeorefError(
+            words or "The adjustment has no unique solution: its constraints leave a datum open."
+        ) from None
+    images = image_tests(block, state, found, prepared)
+    tests = constraint_tests(block, state, found, images.points)
+    return Quality(found, lin.reduced.gradient, images, tests, components(block, state, images, tests))
+
+
+def _robust(block: Block, state: State, options: BlockOptions) -> tuple[Block, State, float]:
+    """The robust solution, with image sigmas near what the residuals show: a loss far too narrow fits too few."""
+    scale = 1.0
+    for _ in range(1 + _ROBUST_ROUNDS):
+        state = solve_block(block, losses=options.losses, options=options.solver, start=state).state
+        factor = min(max(quality(block, state).images.scale, 0.1), 10.0) if len(block.observations) else 1.0
+        if 1.0 / _FAR_OFF < factor < _FAR_OFF:
+            break
+        block, scale = _scaled(block, factor), scale * factor
+    return block, state, scale
+
+
+def _scaled(block: Block, factor: float) -> Block:
+    obs = block.observations
+    return replace(block, observations=replace(obs, sigma_px=obs.sigma_px * factor))
+
+
+def _gate_images(block: Block, state: State, found: Quality, probability: float) -> tuple[Block, int]:
+    """The block without image observations that contradict the rest, and how many they are."""
+    bad = found.images.rejected(probability, found.images.scale)
+    return replace(block, observations=block.observations.take(~bad)), int(bad.sum())
+
+
+def _coherent(block: Block, state: State, options: BlockOptions) -> CoherentSearch:
+    found = quality(block, state)
+    system = pose_shifts(block, state, found.cofactors, found.gradient)
+    if system is None:
+        return CoherentSearch((), False)
+    return coherent_blocks(block, system, reference_m=options.reference_m)
+
+
+def _without_rows(block: Block, search: CoherentSearch) -> Block:
+    keep = np.ones(len(block.pose_priors), bool)
+    for wrong in search.blocks:
+        keep[wrong.rows] = False
+    return replace(block, pose_priors=block.pose_priors.take(keep))
+
+
+def _rescaled(
+    block: Block, solution: BlockSolution, scale: float, options: BlockOptions
+) -> tuple[Block, BlockSolution, float]:
+    """The image sigmas brought to what the residuals show, and the solution for them."""
+    if not len(block.observations):
+        return block, solution, scale
+    factor = quality(block, solution.state).components[IMAGE_OBSERVATIONS].factor
+    if factor is None or abs(factor - 1.0) < _FACTOR_TOLERANCE:
+        return block, solution, scale
+    block = _scaled(block, factor)
+    return block, solve_block(block, options=options.solver, start=solution.state), scale * factor
