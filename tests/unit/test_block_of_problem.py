@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from georef.estimation.adjustment.block import KINDS_OF_POINT
 from georef.estimation.adjustment.cofactors import cofactors
 from georef.estimation.adjustment.eliminate import normal_equations
 from georef.estimation.adjustment.from_problem import Exposure, block_of
@@ -42,10 +43,14 @@ def test_images_by_themselves_are_solved_as_before() -> None:
     size = 6 * len(problem.image_ids)
     ours = found.joint(np.arange(size))
     assert np.abs((ours - known.poses) / scale[:, None] / scale).max() < 1e-3  # the priors are linearised otherwise
-    part = ReferencePart.of(whole, after.state, found.layout, problem.gcps)
-    ours = part.cov(found, np.eye(found.layout.size)[:, :size]) / scale[:, None] / scale
+    part = ReferencePart.of(whole, after.state, found)
+    assert part is not None
+    ours = part.cov(np.eye(found.layout.size)[:, :size]) / scale[:, None] / scale
     theirs = (with_references.poses - known.poses) / scale[:, None] / scale
     assert np.abs(ours - theirs).max() < 2e-3 * np.abs(theirs).max()
+    control_rows = np.flatnonzero(whole.point_priors.kind == KINDS_OF_POINT.index("control"))
+    shared = with_references.control_points - known.control_points
+    assert np.allclose(part.of_given_points(whole, after.state, control_rows), shared, atol=2e-3 * shared.max())
 
 
 def test_images_of_a_rig_share_a_station() -> None:
@@ -65,7 +70,8 @@ def test_images_of_a_rig_share_a_station() -> None:
     assert solution.converged
     lin = normal_equations(whole, solution.state)
     found = cofactors(lin.reduced)
-    part = ReferencePart.of(whole, solution.state, found.layout, problem.gcps)
-    added = part.cov(found, np.eye(found.layout.size))
+    part = ReferencePart.of(whole, solution.state, found)
+    assert part is not None
+    added = part.cov(np.eye(found.layout.size))
     assert np.linalg.eigvalsh(added).min() > -1e-12
     assert added[:6, :6].max() > 0.0

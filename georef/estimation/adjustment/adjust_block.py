@@ -23,6 +23,7 @@ from georef.estimation.adjustment.datum import explain_singular
 from georef.estimation.adjustment.eliminate import IMAGE_OBSERVATIONS, normal_equations
 from georef.estimation.adjustment.group_tests import ImageTests, TermTests, components, constraint_tests, image_tests
 from georef.estimation.adjustment.prepared import Prepared
+from georef.estimation.adjustment.reference_part import ReferencePart
 from georef.estimation.adjustment.shift_system import pose_shifts
 from georef.estimation.adjustment.solver import BlockSolution, SolverOptions, solve_block
 from georef.geometry.rigid import Array
@@ -60,6 +61,7 @@ class Quality:
     images: ImageTests
     constraints: list[TermTests]
     components: dict[str, Component]
+    references: ReferencePart | None  # what the errors of reference images add through automatic GCPs
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,8 +124,9 @@ def quality(block: Block, state: State) -> Quality:
             words or "The adjustment has no unique solution: its constraints leave a datum open."
         ) from None
     images = image_tests(block, state, found, prepared)
-    tests = constraint_tests(block, state, found, images.points)
-    return Quality(found, lin.reduced.gradient, images, tests, components(block, state, images, tests))
+    references = ReferencePart.of(block, state, found)
+    tests = constraint_tests(block, state, found, images.points, references)
+    return Quality(found, lin.reduced.gradient, images, tests, components(block, state, images, tests), references)
 
 
 def _robust(block: Block, state: State, options: BlockOptions) -> tuple[Block, State, float]:
@@ -139,8 +142,12 @@ def _robust(block: Block, state: State, options: BlockOptions) -> tuple[Block, S
 
 
 def _scaled(block: Block, factor: float) -> Block:
-    obs = block.observations
-    return replace(block, observations=replace(obs, sigma_px=obs.sigma_px * factor))
+    """The block with the sigmas of all keypoints scaled, those behind the automatic GCPs included."""
+    priors = block.point_priors
+    automatic = priors.kind == KINDS_OF_POINT.index("automatic")
+    weight = np.where(automatic, factor**-2, 1.0)[:, None, None]
+    given = replace(priors, information=priors.information * weight)
+    return replace(block, observations=block.observations.scaled(factor), point_priors=given)
 
 
 def _gate_images(block: Block, state: State, found: Quality, probability: float) -> tuple[Block, int]:

@@ -17,6 +17,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from georef.estimation.reference_errors import ReferenceErrors
 from georef.geometry.camera import Camera
 from georef.geometry.poses import Poses
 from georef.geometry.projection import Views
@@ -191,6 +192,20 @@ class Distances:
 
 
 @dataclass(frozen=True, eq=False)
+class ReferenceRays:
+    """What automatic GCPs owe to the poses of R reference images, in n rays.
+
+    The information of an automatic GCP holds for references that stand still; their own errors, which the GCPs of a
+    reference share, enter covariances and gates, not the weights: a block stays tied to the reference as published.
+    """
+
+    point: Indices  # (n,) of the block
+    reference: Indices  # (n,)
+    by_reference_pose: Array  # (n, 3, 6) derivative of the given coordinates by the error of the reference
+    errors: ReferenceErrors  # of the R references
+
+
+@dataclass(frozen=True, eq=False)
 class State:
     """Values of all unknowns of a block."""
 
@@ -223,6 +238,7 @@ class Block:
     distances: Distances = field(default_factory=Distances.none)
     antennas: tuple[Antenna, ...] = ()
     drift_information: Array = field(default_factory=lambda: np.zeros((0, 3, 3)))  # (D, 3, 3) about no drift
+    reference_rays: ReferenceRays | None = None
 
     def start(self) -> State:
         """The approximate values as a state."""

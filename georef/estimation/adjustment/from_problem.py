@@ -18,9 +18,10 @@ from georef.estimation.adjustment.block import (
     PointPriors,
     PosePriors,
     PositionPriors,
+    ReferenceRays,
     RigCamera,
 )
-from georef.estimation.adjustment.problem import Problem, control_observations
+from georef.estimation.adjustment.problem import AutomaticGcps, Problem, control_observations
 from georef.estimation.adjustment.solve import control_start
 from georef.geometry.poses import Poses
 from georef.geometry.rigid import Rigid3
@@ -42,7 +43,7 @@ class Exposure:
 def block_of(problem: Problem, exposures: Sequence[Exposure | None]) -> Block:
     """The block of a problem; exposures: of each image, None for one that is a station by itself.
 
-    Points of the problem come first, then its control points; automatic GCPs lead the point priors, in their order.
+    Points of the problem come first, then its control points.
     """
     pairs = list(zip(problem.image_ids, exposures, strict=True))
     names = [f"image {image}" if e is None else f"station {e.station}" for image, e in pairs]
@@ -64,6 +65,7 @@ def block_of(problem: Problem, exposures: Sequence[Exposure | None]) -> Block:
         position_priors=_position_priors(problem, station, mounting),
         point_priors=_point_priors(problem),
         antennas=tuple(Antenna(m.name, m.rig_from_cam.translation) for m in mountings),
+        reference_rays=_reference_rays(problem.gcps),
     )
 
 
@@ -123,6 +125,12 @@ def _position_priors(problem: Problem, station: Indices, mounting: Indices) -> P
         np.full((len(images), 2), -1),
         np.zeros((len(images), 2)),
     )
+
+
+def _reference_rays(gcps: AutomaticGcps) -> ReferenceRays | None:
+    if not len(gcps):
+        return None
+    return ReferenceRays(gcps.point[gcps.ray_gcp], gcps.ray_reference, gcps.by_reference_pose, gcps.reference_errors)
 
 
 def _point_priors(problem: Problem) -> PointPriors:

@@ -18,7 +18,7 @@ from scipy.stats import chi2
 from georef.estimation.adjustment.block import KINDS_OF_POINT, KINDS_OF_POSE, Block, Indices, State
 from georef.estimation.adjustment.cofactors import Cofactors
 from georef.estimation.adjustment.components import Component
-from georef.estimation.adjustment.constraint_terms import POSE_PRIORS, Term, constraint_terms, root
+from georef.estimation.adjustment.constraint_terms import POSE_PRIORS, POSITION_PRIORS, Term, constraint_terms, root
 from georef.estimation.adjustment.eliminate import IMAGE_OBSERVATIONS, GivenPoints
 from georef.estimation.adjustment.kernels_cofactors import (
     RANK_TOLERANCE,
@@ -28,7 +28,11 @@ from georef.estimation.adjustment.kernels_cofactors import (
     test_observations,
 )
 from georef.estimation.adjustment.prepared import Prepared, placed
+from georef.estimation.adjustment.reference_part import ReferencePart
 from georef.geometry.rigid import Array
+
+MEASURED = (POSE_PRIORS, POSITION_PRIORS)
+"""Kinds that say where stations are, which automatic GCPs say as well, with the errors of their references."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,20 +104,31 @@ class TermTests:
         return self.statistic > chi2.ppf(probability, np.maximum(self.dof, 1))
 
     @staticmethod
-    def of(name: str, row: Indices, residual: Array, fitted: Array, weighted: NDArray[np.bool_]) -> TermTests:
-        """fitted: A Q A' (K, m, m), whitened; weighted (K, m): rows that have a weight."""
+    def of(
+        name: str,
+        row: Indices,
+        residual: Array,
+        fitted: Array,
+        weighted: NDArray[np.bool_],
+        shared: Array | float = 0.0,
+    ) -> TermTests:
+        """fitted: A Q A' (K, m, m), whitened; weighted (K, m): rows that have a weight; shared (K, m, m): what the
+        fitted values may be off by beside that, for the statistic alone."""
         both = weighted[:, :, None] & weighted[:, None, :]
         cofactor = np.where(both, np.eye(residual.shape[1]) - fitted, 0.0)
-        statistic, dof = group_statistics(residual, cofactor)
+        statistic, dof = group_statistics(residual, cofactor + np.where(both, shared, 0.0))
         return TermTests(name, row, residual, cofactor, weighted, statistic, dof)
 
 
-def constraint_tests(block: Block, state: State, found: Cofactors, points: Array) -> list[TermTests]:
+def constraint_tests(
+    block: Block, state: State, found: Cofactors, points: Array, references: ReferencePart | None = None
+) -> list[TermTests]:
     """Tests every constraint of a block singly, pose priors and given points by their kind. points: cofactors
-    (P, 3, 3) of `image_tests`."""
+    (P, 3, 3) of `image_tests`; references: what the errors of the references move, which constraints of stations may
+    differ by as well."""
     tests: list[TermTests] = []
     for term in constraint_terms(block, state, found.layout):
-        whole = _term_tests(term, found)
+        whole = _term_tests(term, found, references)
         kinds = block.pose_priors.kind[term.row] if term.name == POSE_PRIORS else None
         tests += [whole] if kinds is None else _by_kind(whole, kinds, KINDS_OF_POSE)
     priors = block.point_priors
@@ -122,7 +137,12 @@ def constraint_tests(block: Block, state: State, found: Cofactors, points: Array
         off = np.einsum("kij,kj->ki", weight, state.points[priors.point] - priors.position)
         fitted = weight @ points[priors.point] @ np.swapaxes(weight, 1, 2)
         weighted = np.any(weight != 0.0, axis=2)
-        whole = TermTests.of("points", np.arange(len(priors)), off, np.nan_to_num(fitted), weighted)
+        shared = np.zeros_like(fitted)
+        control = np.flatnonzero(priors.kind == KINDS_OF_POINT.index("control"))
+        if references is not None and len(control):
+            turned = np.swapaxes(weight[control], 1, 2)
+            shared[control] = weight[control] @ references.of_given_points(block, state, control) @ turned
+        whole = TermTests.of("points", np.arange(len(priors)), off, np.nan_to_num(fitted), weighted, shared)
         tests += _by_kind(whole, priors.kind, KINDS_OF_POINT)
     return tests
 
@@ -139,7 +159,7 @@ def _by_kind(whole: TermTests, kind: Indices, names: tuple[str, ...]) -> list[Te
     ]
 
 
-def _term_tests(term: Term, found: Cofactors) -> TermTests:
+def _term_tests(term: Term, found: Cofactors, references: ReferencePart | None) -> TermTests:
     fitted = np.zeros((*term.residual.shape, term.residual.shape[1]))
     weighted = np.zeros(term.residual.shape, bool)
     for first, by in term.columns:
@@ -147,7 +167,8 @@ def _term_tests(term: Term, found: Cofactors) -> TermTests:
         for other, other_by in term.columns:
             between = found.between(first, by.shape[2], other, other_by.shape[2])
             fitted += by @ between @ np.swapaxes(other_by, 1, 2)
-    return TermTests.of(term.name, term.row, term.residual, fitted, weighted)
+    shared = references.of_rows(term.columns, term.residual.shape[1]) if references and term.name in MEASURED else 0.0
+    return TermTests.of(term.name, term.row, term.residual, fitted, weighted, shared)
 
 
 def group_statistics(residual: Array, cofactor: Array) -> tuple[Array, NDArray[np.int64]]:
