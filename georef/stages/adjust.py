@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from georef.estimation.adjustment.adjust import Adjusted, adjust
+from georef.config import AdjustConfig
+from georef.estimation.adjustment.adjust_block import AdjustedBlock, BlockOptions, adjust_block
+from georef.estimation.adjustment.block import KINDS_OF_POINT, KINDS_OF_POSE, Block
 from georef.estimation.adjustment.components import Component
-from georef.estimation.adjustment.problem import Problem, control_observations
-from georef.estimation.adjustment.solve import solution_views
+from georef.estimation.adjustment.constraint_terms import POSITION_PRIORS
+from georef.estimation.adjustment.eliminate import IMAGE_OBSERVATIONS
+from georef.estimation.adjustment.from_problem import Exposure, block_of
+from georef.estimation.adjustment.image_covariances import image_covariances
+from georef.estimation.adjustment.solver import SolverOptions
 from georef.estimation.epoch_problem import epoch_problem, match_new_images, tie_pairs
 from georef.estimation.guided import PosedFeatures
 from georef.geometry.rigid import Array, Rigid3
@@ -20,9 +25,18 @@ from georef.io.items import read_item, write_item
 from georef.stages.base import StageContext, StageSummary, feature_id, open_features
 from georef.stages.localize import make_task
 from georef.stages.stations import final_outcomes
+from georef.types.campaign import Campaign, Image
 from georef.types.results import Localized, with_estimated_cameras
 
 RESULT = "adjusted.npz"
+GROUPS = {
+    IMAGE_OBSERVATIONS: "image_observations",
+    "automatic": "automatic_gcps",
+    "localized": "pose_priors",
+    POSITION_PRIORS: "gnss",
+    "control": "control_points",
+}
+"""Names in reports of what a block calls its groups of observations."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,11 +85,24 @@ def run(context: StageContext) -> StageSummary:
         keypoints, gate = config.matching.max_keypoints, config.localize.guided_gate
         ties = match_new_images(posed, localized, pairs, task.matcher, keypoints, gate, context.executor.progress)
     problem = epoch_problem(images, localized, posed, ties, reference, context.survey.control, config.adjust)
-    adjusted = adjust(problem, config.adjust)
-    data = _data(problem, adjusted)
-    arrays = _arrays(adjusted, _colors(adjusted.problem, posed))
-    write_item(context.folder / RESULT, {"image_ids": list(adjusted.problem.image_ids), "data": data}, arrays)
+    given = block_of(problem, [exposure_of(image, context.survey.epoch) for image in images])
+    adjusted = adjust_block(given, options_of(config.adjust))
+    data = _data(given, adjusted)
+    arrays = _arrays(adjusted, _colors(adjusted, posed))
+    write_item(context.folder / RESULT, {"image_ids": list(given.image_ids), "data": data}, arrays)
     return StageSummary(_line(data), data, len(localized), len(localized))
+
+
+def exposure_of(image: Image, epoch: Campaign) -> Exposure | None:
+    """The station and mounting of an image whose rig is known."""
+    mounting = epoch.mountings.get(image.image_id)
+    return None if mounting is None or image.station is None else Exposure(image.station, mounting)
+
+
+def options_of(config: AdjustConfig) -> BlockOptions:
+    """How blocks are adjusted, as the configuration says."""
+    options = BlockOptions.of(config.cauchy_scale, config.gate_probability)
+    return replace(options, solver=SolverOptions(max_iterations=config.max_iterations))
 
 
 def read_adjusted(folder: Path) -> AdjustedEpoch:
@@ -97,48 +124,87 @@ def _blocks(joint: Array, indices: list[int]) -> Array:
     return joint[np.ix_(rows, rows)]
 
 
-def _arrays(adjusted: Adjusted | None, colors: NDArray[np.uint8]) -> dict[str, np.ndarray]:
-    none = np.zeros((0, 0))
-    poses = () if adjusted is None else adjusted.solution.world_from_cams
+def _arrays(adjusted: AdjustedBlock | None, colors: NDArray[np.uint8]) -> dict[str, np.ndarray]:
+    if adjusted is None:
+        none = np.zeros((0, 0))
+        return {
+            "poses": np.zeros((0, 4, 4)),
+            "joint_cov": none,
+            "relative_joint_cov": none,
+            "points": np.zeros((0, 3)),
+            "colors": colors,
+        }
+    state = adjusted.solution.state
+    relative, joint = image_covariances(adjusted)
     return {
-        "poses": np.array([pose.matrix() for pose in poses]).reshape(-1, 4, 4),
-        "joint_cov": none if adjusted is None else adjusted.posterior.poses,
-        "relative_joint_cov": none if adjusted is None else adjusted.cofactors.poses,
-        "points": np.zeros((0, 3)) if adjusted is None else adjusted.solution.points,
+        "poses": np.array([pose.matrix() for pose in adjusted.block.world_from_cam(state).to_list()]),
+        "joint_cov": joint,
+        "relative_joint_cov": relative,
+        "points": state.points[_scene_points(adjusted)],
         "colors": colors,
     }
 
 
-def _colors(problem: Problem, posed: list[PosedFeatures]) -> NDArray[np.uint8]:
+def _scene_points(adjusted: AdjustedBlock) -> NDArray[np.int64]:
+    """Tie points and automatic GCPs that the adjustment determined."""
+    shown = np.isfinite(adjusted.quality.images.points).all(axis=(1, 2))
+    shown[_points_of(adjusted.block, "control")] = False
+    return np.flatnonzero(shown)
+
+
+def _points_of(block: Block, kind: str) -> NDArray[np.int64]:
+    priors = block.point_priors
+    return priors.point[priors.kind == KINDS_OF_POINT.index(kind)]
+
+
+def _colors(adjusted: AdjustedBlock, posed: list[PosedFeatures]) -> NDArray[np.uint8]:
     """The colour of each point in one of the images that see it."""
-    colors = np.zeros((len(problem.points), 3), np.uint8)
-    obs = problem.observations
+    colors = np.zeros((len(adjusted.block.points), 3), np.uint8)
+    obs = adjusted.block.observations
     for index, image in enumerate(posed):
-        here = obs.view == index
+        here = (obs.view == index) & (obs.keypoint >= 0)
         colors[obs.point[here]] = image.features.colors_rgb[obs.keypoint[here]]
-    return colors
+    return colors[_scene_points(adjusted)]
 
 
-def _data(given: Problem, adjusted: Adjusted) -> dict[str, Any]:
-    problem, solution = adjusted.problem, adjusted.solution
-    in_gcps = len(problem.gcps)
+def _data(given: Block, adjusted: AdjustedBlock) -> dict[str, Any]:
+    block, solution = adjusted.block, adjusted.solution
+    in_gcps = len(_points_of(block, "automatic"))
     return {
-        "images": len(problem.image_ids),
+        "images": len(block.image_ids),
+        "stations": len(block.station_ids),
         "automatic_gcps": in_gcps,
-        "tie_points": len(problem.points) - in_gcps,
-        "image_observations": len(problem.observations),
-        "gnss_positions": len(problem.position_priors),
-        "pose_priors": len(problem.pose_priors),
-        "gates": {
-            **{name: asdict(count) for name, count in adjusted.gates.items()},
-            "automatic_gcps": {"tested": len(given.gcps), "rejected": len(given.gcps) - in_gcps, "rejected_ids": []},
+        "tie_points": len(_scene_points(adjusted)) - in_gcps,
+        "image_observations": len(block.observations),
+        "gnss_positions": len(block.position_priors),
+        "pose_priors": len(block.pose_priors),
+        "gates": _gates(given, adjusted),
+        "variance_components": {
+            GROUPS[name]: component_data(c) for name, c in adjusted.quality.components.items() if name in GROUPS
         },
-        "variance_components": {name: component_data(c) for name, c in adjusted.components.items()},
         "image_sigma_scale": adjusted.sigma_scale,
         "iterations": solution.iterations,
         "converged": solution.converged,
-        "images_used": _per_image(problem, adjusted),
-        "control": _control(problem, adjusted),
+        "images_used": _per_image(adjusted),
+        "control": _control(given, adjusted),
+    }
+
+
+def _gates(given: Block, adjusted: AdjustedBlock) -> dict[str, Any]:
+    """How many of each group were tested, and which were rejected; of automatic GCPs the number alone."""
+    kinds = np.array(KINDS_OF_POINT)[given.point_priors.kind]
+    tested = {
+        IMAGE_OBSERVATIONS: len(given.observations),
+        KINDS_OF_POSE[0]: len(given.pose_priors),
+        POSITION_PRIORS: len(given.position_priors),
+        **{kind: int((kinds == kind).sum()) for kind in KINDS_OF_POINT},
+    }
+    names = {kind: [r.name for r in adjusted.rejected if r.kind == kind] for kind in tested}
+    rejected = {kind: len(found) for kind, found in names.items()} | {IMAGE_OBSERVATIONS: adjusted.dropped}
+    names["automatic"] = []
+    return {
+        GROUPS[kind]: {"tested": count, "rejected": rejected[kind], "rejected_ids": names[kind]}
+        for kind, count in tested.items()
     }
 
 
@@ -151,34 +217,38 @@ def component_data(component: Component) -> dict[str, Any]:
     }
 
 
-def _per_image(problem: Problem, adjusted: Adjusted) -> dict[str, Any]:
+def _per_image(adjusted: AdjustedBlock) -> dict[str, Any]:
     """Number of observations, residual RMS in pixels and offset from GNSS of each image."""
-    views = solution_views(problem, adjusted.solution)
-    obs = problem.observations
-    residual = views.project(obs.view, adjusted.solution.points[obs.point]) - obs.pixel
-    out: dict[str, Any] = {}
-    for index, name in enumerate(problem.image_ids):
-        here = obs.view == index
-        rms = float(np.sqrt(np.mean(np.square(residual[here])))) if here.any() else None
-        out[name] = {"observations": int(here.sum()), "residual_rms_px": rms}
-        prior = problem.position_priors.get(index)
-        if prior is not None:
-            offset = adjusted.solution.world_from_cams[index].translation - prior.position_in_world
-            out[name]["gnss_residual_m"] = offset.tolist()
+    block, state = adjusted.block, adjusted.solution.state
+    obs = block.observations
+    square = np.square(block.views(state).project(obs.view, state.points[obs.point]) - obs.pixel).mean(axis=1)
+    count = np.bincount(obs.view, minlength=len(block.image_ids))
+    total = np.bincount(obs.view, weights=square, minlength=len(count))
+    out: dict[str, Any] = {
+        name: {"observations": int(n), "residual_rms_px": float(np.sqrt(t / n)) if n else None}
+        for name, n, t in zip(block.image_ids, count, total, strict=True)
+    }
+    places = zip(block.station.tolist(), block.mounting.tolist(), strict=True)
+    image_at = dict(zip(places, block.image_ids, strict=True))
+    priors = block.position_priors
+    measured = state.world_from_rig.take(priors.station).apply(state.lever_arms_m[priors.antenna])
+    for station, mounting, offset in zip(priors.station, priors.antenna, measured - priors.position, strict=True):
+        out[image_at[int(station), int(mounting)]]["gnss_residual_m"] = offset.tolist()
     return out
 
 
-def _control(problem: Problem, adjusted: Adjusted) -> list[dict[str, Any]]:
+def _control(given: Block, adjusted: AdjustedBlock) -> list[dict[str, Any]]:
     """Residuals of the control points that took part, in world axes: estimated minus given."""
-    marks = np.bincount(control_observations(problem).point, minlength=len(problem.control))
+    priors = adjusted.block.point_priors
+    marks = np.bincount(given.observations.point, minlength=len(given.points))
     return [
         {
-            "point": point.point_id,
-            "residual_m": (adjusted.solution.control_points[i] - point.point_in_world).tolist(),
-            "sigma_m": np.sqrt(np.diag(point.cov)).tolist(),
-            "images": int(marks[i]),
+            "point": priors.point_ids[row],
+            "residual_m": (adjusted.solution.state.points[priors.point[row]] - priors.position[row]).tolist(),
+            "sigma_m": np.sqrt(np.diag(np.linalg.inv(priors.information[row]))).tolist(),
+            "images": int(marks[priors.point[row]]),
         }
-        for i, point in enumerate(problem.control)
+        for row in np.flatnonzero(priors.kind == KINDS_OF_POINT.index("control"))
     ]
 
 

@@ -59,7 +59,7 @@ class ReferencePart:
         return self._in_chunks(lambda rows: _dense_columns(columns, rows, width, size), len(columns[0][0]), width)
 
     def of_given_points(self, block: Block, state: State, rows: Indices) -> Array:
-        """What the references add to the covariances (K, 3, 3) of points that have coordinates: rows of point priors."""
+        """What the references add to the covariances (K, 3, 3) of given points: rows of the point priors."""
         every = np.tile(np.eye(3), (len(block.point_priors), 1, 1))
         shape = self.found.layout.size, 3 * len(every)
         by_unknown: Any = _sparse(_coupling(block, state, self.found, every), *shape)
