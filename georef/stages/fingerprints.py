@@ -48,6 +48,10 @@ def control(project: Project, survey: Survey) -> dict[str, Any]:
     return {"control points": digest_of([_plain(p) for p in survey.control])}
 
 
+def control_and_mountings(project: Project, survey: Survey) -> dict[str, Any]:
+    return {**control(project, survey), **mountings(project, survey)}
+
+
 def check(project: Project, survey: Survey) -> dict[str, Any]:
     return {"check points": digest_of([_plain(p) for p in survey.check]), **reference_files(project, survey)}
 
