@@ -222,8 +222,8 @@ class _Network:
 
 
 def _least(matrix: csc_array, size: int) -> tuple[float, Array]:
-    """Least eigenvalue of a symmetric matrix (size, size) with unit diagonal, and its vector, by inverse iteration: exact where it
-    is far below the others, which is all that matters here."""
+    """Least eigenvalue of a symmetric matrix (size, size) with unit diagonal, and its vector, by inverse iteration:
+    exact where it is far below the others, which is all that matters here."""
     factor = splu(csc_array(matrix + _SINGULAR * eye_array(size)))
     vector = np.random.default_rng(0).normal(size=size)
     for _ in range(_ITERATIONS):
