@@ -12,9 +12,9 @@ from __future__ import annotations
 from functools import cached_property
 
 import numpy as np
-from scipy.sparse import block_array, bsr_array, coo_array, csr_array, diags_array
+from scipy.sparse import block_array, bsr_array, coo_array, csc_array, csr_array, diags_array, eye_array
 from scipy.sparse.csgraph import connected_components
-from scipy.sparse.linalg import eigsh
+from scipy.sparse.linalg import splu
 
 from georef.estimation.adjustment import datum_words as words
 from georef.estimation.adjustment.block import Block, Indices, State
@@ -27,7 +27,7 @@ _LOOSE_UNKNOWN = 1e3  # of the border: m, rad, and steps of cameras
 _ROUNDING = 1e-13  # of what cancels in G' N G
 _SINGULAR = 1e-12  # least eigenvalue of N with unit diagonal
 _DENSE = 1500  # unknowns up to which eigenvalues are computed all at once
-_STILL, _TAKES_PART = 1e-9, 0.05
+_STILL, _TAKES_PART, _ITERATIONS = 1e-9, 0.05, 20
 
 
 def explain_singular(block: Block, state: State, reduced: Reduced, *, thorough: bool = True) -> str | None:
@@ -67,17 +67,16 @@ class _Network:
     # --- motions of whole parts ---
 
     def loose_parts(self) -> str | None:
-        others = self._with_product(np.concatenate([self._border, *(motion for _, motion in self._free_rigs)], axis=1))
         for parts in (self._parts(), self._parts_by_images()):
-            loose = [self._loose(stations, others) for stations in parts]
+            loose = [self._loose(stations) for stations in parts]
             worst = max(loose, key=lambda part: part.open.shape[1])
             if worst.open.shape[1]:
                 return words.missing_datum(self._block, worst, whole=len(parts) == 1)
         return None
 
-    def _loose(self, stations: Indices, others: tuple[Array, Array]) -> words.Part:
+    def _loose(self, stations: Indices) -> words.Part:
         motion, centre = self._motions_of(stations)
-        return words.Part(stations, centre, self._open(motion, np.repeat(_LOOSE, (3, 3, 1)), others))
+        return words.Part(stations, centre, self._open(motion, np.repeat(_LOOSE, (3, 3, 1)), follow=True))
 
     def _parts_by_images(self) -> list[Indices]:
         """Stations that see the same points: measured motions between them do not carry the scale over."""
@@ -131,33 +130,38 @@ class _Network:
         sums = [np.bincount(station, column, minlength=self._layout.stations) for column in shift.T]
         return np.stack(sums, axis=1) / count[:, None]
 
-    @cached_property
-    def _border(self) -> Array:
-        """Each unknown of the border alone (n, B)."""
-        out = np.zeros((self._layout.size, self._layout.border))
-        out[self._edge :] = np.eye(self._layout.border)
-        return out
-
-    def _with_product(self, vectors: Array) -> tuple[Array, Array]:
-        return vectors, self._times(vectors)
-
-    def _open(self, motions: Array, loose: Array, others: tuple[Array, Array]) -> Array:
-        """Basis (m, k) of combinations of motions (n, m) that nothing fixes, where others (n, o), which come with
-        their product by N, are free to follow. loose: sigmas (m,) above which a motion is open."""
+    def _open(self, motions: Array, loose: Array, *, follow: bool) -> Array:
+        """Basis (m, k) of combinations of motions (n, m) that nothing fixes. loose: sigmas (m,) above which a motion
+        is open. follow: where rig frames and the border may follow."""
         used = np.linalg.norm(motions, axis=0) > _STILL
-        candidates = np.concatenate([motions[:, used], others[0]], axis=1)
-        product = np.concatenate([self._times(motions[:, used]), others[1]], axis=1)
-        noise = _ROUNDING * np.einsum("nk,n,nk->k", candidates, self._diagonal, candidates)
-        limit = np.concatenate([loose[used], np.full(others[0].shape[1], _LOOSE_UNKNOWN)])
-        scale = 1.0 / np.sqrt(np.maximum(1.0 / limit**2, noise))
-        information = candidates.T @ product * scale * scale[:, None]
-        own = int(used.sum())
-        rest = np.linalg.pinv(information[own:, own:], rcond=_ROUNDING, hermitian=True)
-        left = information[:own, :own] - information[:own, own:] @ rest @ information[own:, :own]
-        values, vectors = np.linalg.eigh(0.5 * (left + left.T))
-        out = np.zeros((len(used), int((values < 1.0).sum())))
-        out[used] = scale[:own, None] * vectors[:, values < 1.0]
+        product = self._times(motions[:, used])
+        information = motions[:, used].T @ product
+        if follow:
+            cross = np.concatenate([product.T @ self._rig_frames, product[self._edge :].T], axis=1)
+            information = information - cross @ self._given_way @ cross.T
+        noise = _ROUNDING * np.einsum("nk,n,nk->k", motions, self._diagonal, motions)[used]
+        found = _open_directions(information, loose[used], noise)
+        out = np.zeros((len(used), found.shape[1]))
+        out[used] = found
         return out
+
+    @cached_property
+    def _rig_frames(self) -> Array:
+        """Motions (n, r) of all rig frames that nothing holds."""
+        return np.concatenate([np.zeros((self._layout.size, 0)), *(motion for _, motion in self._free_rigs)], axis=1)
+
+    @cached_property
+    def _given_way(self) -> Array:
+        """Pseudo-inverse of the information of rig frames and the border (r + B, r + B), stations held otherwise."""
+        frames, corner = self._rig_frames, self._reduced.corner
+        product = self._times(frames)
+        information = np.block([[frames.T @ product, product[self._edge :].T], [product[self._edge :], corner]])
+        noise = _ROUNDING * np.concatenate(
+            [np.einsum("nk,n,nk->k", frames, self._diagonal, frames), self._diagonal[self._edge :]]
+        )
+        scale = 1.0 / np.sqrt(np.maximum(_LOOSE_UNKNOWN**-2, noise))
+        inverse = np.linalg.pinv(information * scale * scale[:, None], rcond=_ROUNDING, hermitian=True)
+        return np.asarray(inverse * scale * scale[:, None], dtype=np.float64)
 
     # --- rig frames and single unknowns of the border ---
 
@@ -180,16 +184,16 @@ class _Network:
 
     def loose_rigs(self) -> str | None:
         for rig, motion in self._free_rigs:
-            if self._open(motion, np.repeat(_LOOSE[1::-1], 3), self._with_product(self._border[:, :0])).shape[1]:
+            if self._open(motion, np.repeat(_LOOSE[1::-1], 3), follow=False).shape[1]:
                 return words.loose_rig([self._block.mountings[i].name for i in rig])
         return None
 
     def loose_border(self) -> str | None:
-        others = self._with_product(self._border[:, :0])
-        open_ = self._open(self._border, np.full(self._layout.border, _LOOSE_UNKNOWN), others)
-        if not open_.shape[1]:
+        noise = np.asarray(_ROUNDING * self._diagonal[self._edge :], dtype=np.float64)
+        found = _open_directions(self._reduced.corner, np.full(self._layout.border, _LOOSE_UNKNOWN), noise)
+        if not found.shape[1]:
             return None
-        return words.unobserved_unknown(self._block, self._layout, self._edge + int(np.argmax(np.abs(open_[:, 0]))))
+        return words.unobserved_unknown(self._block, self._layout, self._edge + int(np.argmax(np.abs(found[:, 0]))))
 
     # --- all else ---
 
@@ -213,9 +217,27 @@ class _Network:
         else:
             border, corner = coo_array(self._reduced.border), coo_array(self._reduced.corner)
             whole = block_array([[self._stations, border], [border.T, corner]], format="csc")
-            scaled = (diags_array(scale) @ whole @ diags_array(scale)).tocsc()
-            values, vectors = eigsh(scaled, k=1, sigma=-_SINGULAR, which="LM")
+            return _least(csc_array(diags_array(scale) @ whole @ diags_array(scale)), self._layout.size)
         return float(values[0]), vectors[:, 0]
+
+
+def _least(matrix: csc_array, size: int) -> tuple[float, Array]:
+    """Least eigenvalue of a symmetric matrix (size, size) with unit diagonal, and its vector, by inverse iteration:
+    exact where it is far below the others, which is all that matters here."""
+    factor = splu(csc_array(matrix + _SINGULAR * eye_array(size)))
+    vector = np.random.default_rng(0).normal(size=size)
+    for _ in range(_ITERATIONS):
+        vector = factor.solve(vector)
+        vector /= np.linalg.norm(vector)
+    return float(vector @ (matrix @ vector)), vector
+
+
+def _open_directions(information: Array, loose: Array, noise: Array) -> Array:
+    """Basis (m, k) of directions whose information (m, m) is below what a sigma of loose (m,), or rounding, leaves."""
+    scale = 1.0 / np.sqrt(np.maximum(loose**-2, noise))
+    scaled = information * scale * scale[:, None]
+    values, vectors = np.linalg.eigh(0.5 * (scaled + scaled.T))
+    return scale[:, None] * vectors[:, values < 1.0]
 
 
 def _stations_matrix(reduced: Reduced) -> csr_array:
