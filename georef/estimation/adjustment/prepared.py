@@ -137,9 +137,7 @@ def counting_order(key, count):
     return order
 
 
-def station_pairs(
-    tracks: Tracks, station: NDArray[np.int32], layout: Layout, tied: Indices
-) -> tuple[Indices, Indices]:
+def station_pairs(tracks: Tracks, station: NDArray[np.int32], layout: Layout, tied: Indices) -> tuple[Indices, Indices]:
     """The pattern (first, column) of `Reduced`; tied (K, 2): further pairs, the smaller station first."""
     at_station, track, slot = _incidence(tracks.start, tracks.image, tracks.kept, station)
     by_station = counting_order(at_station, layout.stations)
