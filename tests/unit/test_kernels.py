@@ -1,4 +1,4 @@
-"""Compiled lenses against those of georef.geometry: images, derivatives by point and by every unknown, what is shown."""
+"""Compiled lenses against those of georef.geometry: images, derivatives by point and unknowns."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def test_lens_is_that_of_geometry(camera: Camera) -> None:
     shown = np.array([lens(model, parameters, 0, *p, o) for p, o in zip(points, out, strict=True)])
     image, by_point, _ = camera.lens.derivatives(points, camera.coefficients, np.asarray(camera.limit))
     assert np.array_equal(shown, np.isfinite(project(camera, points)).all(axis=1))
-    assert 50 < shown.sum() < len(points)
+    assert 10 < shown.sum() < len(points)
     assert np.allclose(out[shown, :2], image[shown], rtol=1e-12, atol=1e-12)
     assert np.allclose(out[shown, 2:].reshape(-1, 2, 3), by_point[shown], rtol=1e-9, atol=1e-9)
 

@@ -2,6 +2,9 @@
 
 The same lenses as georef.geometry.lenses, one point at a time. A row of parameters is fx, fy, cx, cy, the coefficients,
 and the limit last, as in `Camera.parameters`.
+
+The compiler's cache looks at the file of a kernel alone, not at those it calls: after a change here, remove the *.nbi
+files of this folder's __pycache__.
 """
 
 from __future__ import annotations
