@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from georef.estimation.adjustment import gtsam_factors as factors
-from georef.estimation.adjustment.block import Block, State
+from georef.estimation.adjustment.block import KINDS_OF_POINT, Block, State
 from georef.estimation.adjustment.constraint_terms import (
     CALIBRATIONS,
     DISTANCES,
@@ -30,7 +30,7 @@ from georef.estimation.adjustment.gtsam_variables import Variables, pose3
 from georef.estimation.adjustment.reduced import Layout
 from georef.geometry.rigid import Array
 
-IMAGE_OBSERVATIONS, POINT_PRIORS = "image observations", "point priors"
+IMAGE_OBSERVATIONS = "image observations"
 _STEP_TOLERANCE, _LAMBDA_INITIAL = 1e-7, 1e-6
 
 
@@ -45,7 +45,7 @@ class GtsamSolution:
 class BlockGraph:
     """The graph of a block at a state, its values there, and what its keys stand for.
 
-    cauchy: scales in sigmas of Cauchy losses by kind (names of constraint_terms, IMAGE_OBSERVATIONS, POINT_PRIORS).
+    cauchy: scales in sigmas of Cauchy losses by kind (names of constraint_terms, IMAGE_OBSERVATIONS, KINDS_OF_POINT).
     native: use GTSAM's own factors where it has them. Image observations that the state does not show are left out;
     `shown` (n,) says which are in.
     """
@@ -97,7 +97,8 @@ class BlockGraph:
         priors = self.block.point_priors
         for i in range(len(priors)):
             key = self.variables.point(int(priors.point[i]))
-            self._add_weight(key, priors.information[i], factors.from_vector(key, priors.position[i]), POINT_PRIORS)
+            difference = factors.from_vector(key, priors.position[i])
+            self._add_weight(key, priors.information[i], difference, KINDS_OF_POINT[priors.kind[i]])
 
     def _add_poses(self) -> None:
         block, priors, measured = self.block, self.block.pose_priors, self.block.relative_poses
