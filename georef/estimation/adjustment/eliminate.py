@@ -8,11 +8,11 @@ from typing import cast
 
 import numpy as np
 
+from georef.estimation.adjustment.batches import Work
 from georef.estimation.adjustment.block import KINDS_OF_POINT, Block, Indices, State
 from georef.estimation.adjustment.constraint_terms import Term, constraint_terms
 from georef.estimation.adjustment.kernels_eliminate import Sums, eliminate_points
 from georef.estimation.adjustment.kernels_move import all_cost
-from georef.estimation.adjustment.kernels_points import Work
 from georef.estimation.adjustment.prepared import Prepared, placed
 from georef.estimation.adjustment.reduced import Layout, Reduced
 from georef.geometry.rigid import Array
