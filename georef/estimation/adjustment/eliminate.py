@@ -8,11 +8,11 @@ from typing import cast
 
 import numpy as np
 
+from georef.estimation.adjustment.batches import Work
 from georef.estimation.adjustment.block import KINDS_OF_POINT, Block, Indices, State
 from georef.estimation.adjustment.constraint_terms import Term, constraint_terms
 from georef.estimation.adjustment.kernels_eliminate import Sums, eliminate_points
 from georef.estimation.adjustment.kernels_move import all_cost
-from georef.estimation.adjustment.kernels_points import Work
 from georef.estimation.adjustment.prepared import Prepared, placed
 from georef.estimation.adjustment.reduced import Layout, Reduced
 from georef.geometry.rigid import Array
@@ -100,9 +100,7 @@ def total_cost(
     point the lens does not show; how many those are."""
     losses, prepared = losses or {}, prepared or Prepared.of(block)
     scale = losses.get(IMAGE_OBSERVATIONS, 0.0)
-    cost, hidden = all_cost(
-        *(prepared.tracks, prepared.images, placed(state), state.points, scale, hidden_square)
-    )
+    cost, hidden = all_cost(*(prepared.tracks, prepared.images, placed(state), state.points, scale, hidden_square))
     return float(cost) + constraint_cost(block, state, prepared.layout, losses), int(hidden)
 
 
@@ -114,7 +112,9 @@ def constraint_cost(block: Block, state: State, layout: Layout, losses: Losses) 
     return cost
 
 
-def promised_by_constraints(block: Block, state: State, step: Array, moved: Array, layout: Layout, losses: Losses) -> float:
+def promised_by_constraints(
+    block: Block, state: State, step: Array, moved: Array, layout: Layout, losses: Losses
+) -> float:
     """Decrease of the cost of constraints that their linear model promises for a step (6 S + B,), points moved to
     (P, 3)."""
     before, after = 0.0, 0.0

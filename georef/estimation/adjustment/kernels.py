@@ -2,6 +2,9 @@
 
 The same lenses as georef.geometry.lenses, one point at a time. A row of parameters is fx, fy, cx, cy, the coefficients,
 and the limit last, as in `Camera.parameters`.
+
+The compiler's cache looks at the file of a kernel alone, not at those it calls: after a change here, remove the *.nbi
+files of this folder's __pycache__.
 """
 
 from __future__ import annotations
@@ -19,7 +22,7 @@ from georef.geometry.rigid import Array
 # NaN and infinity keep their meaning: only sums may be reordered and multiplications joined with additions.
 kernel = numba.njit(cache=True, error_model="numpy", fastmath={"contract", "reassoc", "nsz"})
 
-PINHOLE, BROWN, FISHEYE = (list(MODELS).index(name) for name in ("pinhole", "brown", "fisheye"))
+PINHOLE, BROWN, FISHEYE, RATIONAL = (list(MODELS).index(name) for name in ("pinhole", "brown", "fisheye", "rational"))
 FOCAL, ASPECT, CENTRE_X, CENTRE_Y, FIRST_COEFFICIENT = range(5)
 _ON_AXIS = 1e-9
 
@@ -60,22 +63,28 @@ def lens(model, parameters, row, x, y, z, out):
     a, b = x * inverse, y * inverse
     out[0], out[1] = a, b
     xx, xy, yy = 1.0, 0.0, 1.0
-    if model == BROWN:
+    if model != PINHOLE:
         if not a * a + b * b <= limit * limit:
             return False
-        xx, xy, yy = _brown(parameters, row, a, b, out)
+        xx, xy, yy = _bend(model, parameters, row, a, b, out)
     out[2], out[3], out[4] = xx * inverse, xy * inverse, -(xx * a + xy * b) * inverse
     out[5], out[6], out[7] = xy * inverse, yy * inverse, -(xy * a + yy * b) * inverse
     return True
 
 
 @kernel
-def _brown(k, row, x, y, out):
-    """Distorts slopes into out[:2]; the symmetric derivative xx, xy, yy."""
+def _bend(model, k, row, x, y, out):
+    """Distorts slopes by Brown's or the rational model into out[:2]; the symmetric derivative xx, xy, yy."""
     k1, k2, p1, p2, k3 = k[row, 4], k[row, 5], k[row, 6], k[row, 7], k[row, 8]
     r2 = x * x + y * y
     radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
-    rate = 2.0 * (k1 + r2 * (2.0 * k2 + 3.0 * r2 * k3))
+    rate = k1 + r2 * (2.0 * k2 + 3.0 * r2 * k3)
+    if model == RATIONAL:
+        k4, k5, k6 = k[row, 9], k[row, 10], k[row, 11]
+        below = 1.0 + r2 * (k4 + r2 * (k5 + r2 * k6))
+        radial /= below
+        rate = (rate - radial * (k4 + r2 * (2.0 * k5 + 3.0 * r2 * k6))) / below
+    rate *= 2.0
     out[0] = x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x)
     out[1] = y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y
     return (
@@ -109,14 +118,13 @@ def _fisheye(k, row, limit, x, y, z, out):
 
 
 @kernel
-def by_coefficient(model, index, x, y, z):
+def _by_coefficient(index, model, k, row, x, y, z):
     """Derivative of the image coordinates by one coefficient of a lens that shows the point."""
     if model == FISHEYE:
         across = sqrt(x * x + y * y)
-        angle = atan2(across, z)
         if across <= _ON_AXIS * abs(z):
             return 0.0, 0.0
-        power = angle ** (2 * index + 3)
+        power = atan2(across, z) ** (2 * index + 3)
         return power * x / across, power * y / across
     a, b = x / z, y / z
     r2 = a * a + b * b
@@ -124,7 +132,14 @@ def by_coefficient(model, index, x, y, z):
         return 2.0 * a * b, r2 + 2.0 * b * b
     if index == 3:
         return r2 + 2.0 * a * a, 2.0 * a * b
-    power = r2 if index == 0 else (r2 * r2 if index == 1 else r2 * r2 * r2)
+    below = 1.0
+    if model == RATIONAL:
+        below = 1.0 + r2 * (k[row, 9] + r2 * (k[row, 10] + r2 * k[row, 11]))
+    if index <= 4:  # k1, k2, k3
+        power = r2 ** (index + 1 if index < 2 else 3) / below
+    else:  # k4, k5, k6
+        above = 1.0 + r2 * (k[row, 4] + r2 * (k[row, 5] + r2 * k[row, 8]))
+        power = -(r2 ** (index - 4)) * above / (below * below)
     return a * power, b * power
 
 
@@ -140,5 +155,5 @@ def by_unknown(code, model, parameters, row, cam_x, cam_y, cam_z, image_x, image
         return fx, 0.0
     if code == CENTRE_Y:
         return 0.0, fx
-    a, b = by_coefficient(model, code - FIRST_COEFFICIENT, cam_x, cam_y, cam_z)
+    a, b = _by_coefficient(code - FIRST_COEFFICIENT, model, parameters, row, cam_x, cam_y, cam_z)
     return a * fx, b * fy

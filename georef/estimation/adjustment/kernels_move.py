@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from georef.estimation.adjustment.batches import BATCH
 from georef.estimation.adjustment.kernels import kernel, lens
 from georef.estimation.adjustment.kernels_points import (
-    BATCH,
     keep,
     linearize,
     loss,

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from georef.estimation.adjustment.batches import Tracks, Work, work_for
 from georef.estimation.adjustment.block import Block, Indices, State
 from georef.estimation.adjustment.kernels import (
     ASPECT,
@@ -18,7 +19,6 @@ from georef.estimation.adjustment.kernels import (
     Placed,
     kernel,
 )
-from georef.estimation.adjustment.kernels_points import Tracks, Work, work_for
 from georef.estimation.adjustment.reduced import Layout
 from georef.geometry.camera import Camera
 from georef.geometry.poses import Poses

@@ -14,6 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from georef.errors import GeorefError
+from georef.estimation.adjustment.batches import Work
 from georef.estimation.adjustment.block import Block, Indices, State
 from georef.estimation.adjustment.block_cholesky import Pattern, SingularMatrix
 from georef.estimation.adjustment.eliminate import (
@@ -27,7 +28,6 @@ from georef.estimation.adjustment.eliminate import (
     promised_by_constraints,
 )
 from georef.estimation.adjustment.kernels_move import move_points
-from georef.estimation.adjustment.kernels_points import Work
 from georef.estimation.adjustment.prepared import Prepared, placed
 from georef.estimation.adjustment.reduced import Layout
 from georef.estimation.adjustment.reduced_solve import reduced_step
@@ -106,7 +106,7 @@ class _Trial(NamedTuple):
     step: Array
     state: State
     cost: float
-    promised: float
+    ratio: float  # of the achieved to the promised decrease; 1 where both are lost in rounding
     hidden: int
 
 
@@ -121,22 +121,24 @@ class _Solver:
         self._hidden_cost = cost_of_squares(np.array([_HIDDEN_SQUARE]), self._image_scale)
 
     def run(self, state: State, on_iteration: Callable[[Iteration], None] | None) -> BlockSolution:
-        damping, converged, number = self._options.damping, False, 0
+        damping, number = self._options.damping, 0
         lin = self._linearized(state, damping)
-        while number < self._options.max_iterations and not converged:
+        while True:
             number += 1
-            trial, damping, lin = self._accepted_step(state, lin, damping)
-            before, state = lin.cost, trial.state
+            before = lin.cost
+            trial, used, lin = self._accepted_step(state, lin, damping)
+            state, cost = trial.state, trial.cost - trial.hidden * self._hidden_cost
             largest = float(np.abs(trial.step).max(initial=0.0))
-            cost = trial.cost - trial.hidden * self._hidden_cost
-            converged = largest < self._options.step_tolerance or before - cost < self._options.cost_tolerance * before
-            _log.info("iteration %d: cost %.6g, largest step %.2g, damping %.1g", number, cost, largest, damping)
+            small = largest < self._options.step_tolerance or before - cost < self._options.cost_tolerance * before
+            # Only a step without damping says that the solution is unique.
+            converged = small and (used == 0.0 or self._options.free_gauge)
+            damping = 0.0 if small and not self._options.free_gauge else self._relaxed(used, trial.ratio)
+            _log.info("iteration %d: cost %.6g, largest step %.2g, damping %.1g", number, cost, largest, used)
             if on_iteration:
-                on_iteration(Iteration(number, state, cost, largest, damping))
-            if converged or number == self._options.max_iterations:
+                on_iteration(Iteration(number, state, cost, largest, used))
+            if converged or number >= self._options.max_iterations:
                 return BlockSolution(state, cost, number, converged, trial.hidden, lin.undetermined)
             lin = self._linearized(state, damping)
-        return BlockSolution(state, lin.cost, number, converged, lin.hidden, lin.undetermined)
 
     def _linearized(self, state: State, damping: float) -> Linearized:
         return normal_equations(
@@ -144,16 +146,13 @@ class _Solver:
         )
 
     def _accepted_step(self, state: State, lin: Linearized, damping: float) -> tuple[_Trial, float, Linearized]:
-        """The first step that lowers the cost, the damping for the next one, and the equations it came from."""
+        """The first step that lowers the cost, its damping, and the equations it came from."""
         growth = 10.0
         cost = lin.cost + lin.hidden * self._hidden_cost
         while damping < _HIGHEST_DAMPING:
-            trial = self._trial(state, lin, damping)
-            if trial is not None:
-                small = trial.promised <= _ROUNDING * cost
-                ratio = 1.0 if small else (cost - trial.cost) / trial.promised
-                if cost - trial.cost >= (-_ROUNDING * cost if small else 0.0):
-                    return trial, self._relaxed(damping, ratio), lin
+            trial = self._trial(state, lin, damping, cost)
+            if trial is not None and trial.ratio > 0.0:
+                return trial, damping, lin
             damping = max(damping * growth, 1e-6)
             growth *= 2.0
             lin = self._linearized(state, damping)
@@ -169,14 +168,14 @@ class _Solver:
         lower = damping * factor
         return max(lower if lower > _NO_DAMPING else 0.0, lowest)
 
-    def _trial(self, state: State, lin: Linearized, damping: float) -> _Trial | None:
-        """The step at a damping; None where the equations have no solution at it."""
+    def _trial(self, state: State, lin: Linearized, damping: float, before: float) -> _Trial | None:
+        """The step at a damping from a state of cost `before`; None where the equations have no solution at it."""
         try:
             step = reduced_step(lin.reduced, self._pattern, damping * lin.diagonal)
         except SingularMatrix as error:
             if damping > 0.0:
                 return None
-            raise self._singular(error) from None
+            raise self._singular(error, state, lin) from None
         moved = moved_state(self._prepared.layout, state, step)
         given = GivenPoints.at(self._block, state.points, self._losses)
         promised, cost, hidden = move_points(
@@ -187,18 +186,20 @@ class _Solver:
         args = (self._prepared.layout, self._losses)
         cost += constraint_cost(self._block, moved, *args)
         promised += promised_by_constraints(self._block, state, step, moved.points, *args)
-        return _Trial(step, moved, float(cost), float(promised), int(hidden))
+        lost = abs(promised) <= _ROUNDING * before and abs(before - cost) <= _ROUNDING * before
+        ratio = 1.0 if lost else ((before - cost) / promised if promised > 0.0 else -1.0)
+        return _Trial(step, moved, float(cost), float(ratio), int(hidden))
 
-    def _singular(self, error: SingularMatrix) -> GeorefError:
-        stations = self._prepared.layout.stations
-        loose = (
-            f"station {self._block.station_ids[error.unknown // 6]!r}"
-            if error.unknown < 6 * stations
-            else "a shared unknown (mounting, calibration, lever arm, drift or end of a distance)"
-        )
+    def _singular(self, error: SingularMatrix, state: State, lin: Linearized) -> GeorefError:
+        """What is missing, in the words of `datum` where it finds a reason."""
+        from georef.estimation.adjustment.datum import explain_singular
+        from georef.estimation.adjustment.datum_words import name_of_unknown
+
+        unknown = name_of_unknown(self._block, self._prepared.layout, error.unknown)
         return GeorefError(
-            f"The adjustment has no unique solution: its observations and constraints do not fix {loose}.",
-            "Add control points, GNSS positions or pose priors, or hold unknowns that nothing determines.",
+            f"The adjustment has no unique solution: its observations and constraints do not fix {unknown}.",
+            explain_singular(self._block, state, lin.reduced)
+            or "Add control points, GNSS positions or pose priors, or hold unknowns that nothing determines.",
         )
 
 
