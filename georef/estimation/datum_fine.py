@@ -1,9 +1,9 @@
 """Small differences between paired positions: which of a shift, an antenna offset, a turn and a scale explain them.
 
-Errors of neighbouring positions go together (GNSS drifts), so that N positions are far from N independent ones. They
-are averaged over stretches of the drive, and a regression on the stretches takes its noise from their scatter, with a
-part common to each stretch as in a meta-analysis (DerSimonian and Laird 1986). Explanations are compared by F tests;
-those that do equally well with as few parts are all returned.
+Errors of neighbouring positions go together (GNSS drifts), so that N positions are far from N independent ones.
+Positions are averaged over stretches of the drive, and a regression on the stretches knows what neighbours share; where
+stretches scatter more than that, its noise is their scatter. Explanations are compared by F tests; those that do
+equally well with as few parts are all returned.
 """
 
 from __future__ import annotations
@@ -24,9 +24,19 @@ _GATE = 5.0  # sigmas from a robust fit, and from the middle of a stretch
 _EXPLAINED = 0.5  # share of the pairs
 _LARGEST_SCATTER = 10.0  # times what is stated: beyond, it is no noise
 _ROBUST_STEPS = 20
-_MOST_ALIKE = 0.8  # correlation of neighbouring stretches
 _RANK = 1e-6
 _FROM_MAD = 1.4826
+
+
+Mask = NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class Shared:
+    """Errors that neighbouring positions share: sigma of a coordinate, correlation exp(-distance / over), in pairs."""
+
+    sigma_m: float
+    over: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,7 +55,6 @@ class Explanation:
 class _Averaged:
     """Differences and their regressors, whitened, one block of rows for each stretch."""
 
-    stretches: int  # G
     y: Array  # (G d,)
     parts: dict[str, Array]  # each (G d, q)
 
@@ -58,11 +67,11 @@ class Explained:
     """
 
     explanations: tuple[Explanation, ...]
-    inlier: NDArray[np.bool_]
+    inlier: Mask
 
 
-def explain(difference: Array, sigma: Array, parts: dict[str, Array]) -> Explained | None:
-    """What explains differences (N, d), in the order of the drive, sigma (N,) of each coordinate.
+def explain(difference: Array, sigma: Array, shared: Shared, parts: dict[str, Array]) -> Explained | None:
+    """What explains differences (N, d), in the order of the drive, sigma (N,) of each coordinate's own errors.
 
     parts: name -> (N, d, q) derivatives by its q values. None where all parts together explain less than half.
     """
@@ -70,7 +79,9 @@ def explain(difference: Array, sigma: Array, parts: dict[str, Array]) -> Explain
     inlier = np.abs(residual).max(axis=1) < _GATE * scale * sigma
     if inlier.mean() < _EXPLAINED or scale > _LARGEST_SCATTER:
         return None
-    averaged = _averaged(difference, residual, scale * sigma, parts, inlier)
+    averaged = _averaged(
+        difference=difference, residual=residual, sigma=scale * sigma, shared=shared, parts=parts, inlier=inlier
+    )
     return Explained(() if averaged is None else _smallest(averaged, tuple(parts)), inlier)
 
 
@@ -93,7 +104,7 @@ def _smallest(averaged: _Averaged, parts: tuple[str, ...]) -> tuple[Explanation,
     """Nothing, where all parts together take away no more than noise would; else the fewest that leave only noise."""
     everything, rank = _fit(averaged, parts)
     noise, freedom = _noise(averaged, parts)
-    if freedom < 1.0 or rank == 0:
+    if freedom < 1 or rank == 0:
         return ()
     if f_distribution.sf(everything / rank / noise, rank, freedom) > FALSE_ALARM:
         return ()
@@ -110,44 +121,39 @@ def _smallest(averaged: _Averaged, parts: tuple[str, ...]) -> tuple[Explanation,
     return ()
 
 
-def _noise(averaged: _Averaged, parts: tuple[str, ...]) -> tuple[float, float]:
-    """Mean square of what all parts leave, no less than stated, and its degrees of freedom.
-
-    Neighbouring stretches err alike: averages over them have the noise of fewer that are independent, by the factor
-    (1 + rho) / (1 - rho) of a first-order process with the correlation rho of neighbours.
-    """
-    basis = _basis(np.concatenate([averaged.parts[name] for name in parts], axis=1))
-    left = averaged.y - basis @ (basis.T @ averaged.y)
-    freedom = len(left) - basis.shape[1]
-    if freedom < 1:
-        return 1.0, 0.0
-    rows = left.reshape(averaged.stretches, -1)
-    alike = float(np.sum(rows[1:] * rows[:-1]) / max(np.sum(rows * rows), 1e-300)) + basis.shape[1] / len(left)
-    alike = min(max(alike, 0.0), _MOST_ALIKE)
-    fewer = (1.0 - alike) / (1.0 + alike)
-    return max(1.0, float(left @ left) / freedom) / fewer, max(1.0, freedom * fewer)
+def _noise(averaged: _Averaged, parts: tuple[str, ...]) -> tuple[float, int]:
+    """Mean square of what all parts leave, no less than stated, and its degrees of freedom."""
+    taken, rank = _fit(averaged, parts)
+    freedom = len(averaged.y) - rank
+    return (max(1.0, float(averaged.y @ averaged.y - taken) / freedom), freedom) if freedom > 0 else (1.0, 0)
 
 
 def _averaged(
-    difference: Array, residual: Array, sigma: Array, parts: dict[str, Array], inlier: NDArray[np.bool_]
+    *, difference: Array, residual: Array, sigma: Array, shared: Shared, parts: dict[str, Array], inlier: Mask
 ) -> _Averaged | None:
     """Averages over stretches; residuals of a robust fit say which differences stray from their stretch."""
     d, used = difference.shape[1], np.flatnonzero(inlier)
     groups = [g for g in np.array_split(used, min(_STRETCHES, len(used))) if len(g)]
-    means, within, columns = [], [], {name: [] for name in parts}
+    means, variances, places, columns = [], [], [], {name: [] for name in parts}
     for group in groups:
         kept = group[_near_the_middle(residual[group], sigma[group])]
         weight = 1.0 / sigma[kept] ** 2
         means.append(np.average(difference[kept], axis=0, weights=weight))
-        within.append(np.full(d, 1.0 / weight.sum()))
+        variances.append(1.0 / weight.sum())
+        places.append(np.average(kept, weights=weight))
         for name, design in parts.items():
             columns[name].append(np.average(design[kept], axis=0, weights=weight))
     if len(means) < _FEWEST:
         return None
-    y, variance = np.concatenate(means), np.concatenate(within)
-    stacked = {name: np.concatenate(columns[name]) for name in parts}
-    root = np.sqrt(variance + _between(y, variance, np.concatenate(list(stacked.values()), axis=1)))
-    return _Averaged(len(means), y / root, {name: design / root[:, None] for name, design in stacked.items()})
+    apart = np.abs(np.subtract.outer(places, places))
+    factor = np.linalg.cholesky(np.diag(variances) + shared.sigma_m**2 * np.exp(-apart / shared.over))
+
+    def whitened(rows: Array) -> Array:
+        """Rows (G, d, q), those of one coordinate with each other."""
+        return np.linalg.solve(factor, rows.reshape(len(rows), -1)).reshape(len(rows) * d, -1)
+
+    y = whitened(np.array(means)[:, :, None])[:, 0]
+    return _Averaged(y, {name: whitened(np.array(column)) for name, column in columns.items()})
 
 
 def _near_the_middle(residual: Array, sigma: Array) -> NDArray[np.bool_]:
@@ -155,17 +161,6 @@ def _near_the_middle(residual: Array, sigma: Array) -> NDArray[np.bool_]:
         return np.ones(len(residual), bool)
     off = np.abs(residual - np.median(residual, axis=0)).max(axis=1) / sigma
     return off <= _GATE * max(1.0, _FROM_MAD * float(np.median(off)))
-
-
-def _between(y: Array, variance: Array, design: Array) -> float:
-    """Variance common to the rows of a stretch beyond that of averaging, by the method of moments."""
-    root = np.sqrt(variance)
-    basis = _basis(design / root[:, None])
-    white = y / root
-    rest = float(white @ white - np.square(basis.T @ white).sum())
-    freedom = len(y) - basis.shape[1]
-    total = float(np.sum((1.0 - np.square(basis).sum(axis=1)) / variance))
-    return max(0.0, (rest - freedom) / total) if freedom > 0 and total > 0 else 0.0
 
 
 def _basis(design: Array) -> Array:

@@ -18,6 +18,7 @@ FOOT_M, SURVEY_FOOT_M = 0.3048, 1200.0 / 3937.0
 _CUT = 25.0  # squared residual in sigmas from which on a pair is a blunder
 _AS_GOOD = 30.0  # difference of costs at which two hypotheses explain the pairs alike
 _EXPLAINED = 0.5  # share of pairs
+_NEARLY_ALL = 0.8  # of the pairs that the best explains
 _COARSE = 0.02  # of the extent: what a frame of another place bends
 _SAMPLES, _SCORED = 300, 1500
 _STANDING = 20.0  # sigmas of extent below which pairs show shifts only
@@ -72,9 +73,11 @@ def gross_relation(first: Array, second: Array, sigma: Array) -> Gross | None:
         for axes, matrix in maps.items()
         for unit, scale in SCALES.items()
     }
-    costs = {key: cost for key, (_, cost) in found.items()}
-    best = min(costs.values())
-    alike = [key for key, cost in costs.items() if cost <= best + _AS_GOOD]  # the plainest first, by the order of maps
+    best, least = min(found.values(), key=lambda pair: pair[1])
+    enough = _NEARLY_ALL * best.inlier.mean()
+    alike = [  # the plainest first, by the order of maps
+        key for key, (map_, cost) in found.items() if cost <= least + _AS_GOOD or map_.inlier.mean() >= enough
+    ]
     chosen = found[alike[0]][0]
     if chosen.inlier.mean() >= _EXPLAINED:
         others = alike[1:]

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from georef.estimation.datum_fine import Explained, explain
+from georef.estimation.datum_fine import Explained, Shared, explain
 from georef.estimation.datum_gross import Gross, free_similarity, gross_relation, stands_still
 from georef.estimation.datum_wording import (
     Finding,
@@ -37,9 +37,10 @@ _LARGEST_TURN = 0.01  # rad, or part of one
 class Paired:
     """N positions of the same things by two sources, in one world frame, in the order of the drive.
 
-    sigma_m (N, 3): of the difference, east, north, up. heading_rad (N,): of the vehicle, clockwise from north, where
-    there is one. crs_origin_m: easting, northing of the world frame's origin, and its latitude, where they are known;
-    geoid_m: height of the geoid above the ellipsoid there.
+    sigma_m (N, 3): of the difference, east, north, up, of errors that each pair has to itself. shared_m: sigma of
+    errors that neighbours share, such as the drift of GNSS, over so many pairs (0: there are none). heading_rad (N,):
+    of the vehicle, clockwise from north, where there is one. crs_origin_m: easting, northing of the world frame's
+    origin, and its latitude, where they are known; geoid_m: height of the geoid above the ellipsoid there.
     """
 
     first_name: str
@@ -47,6 +48,8 @@ class Paired:
     first: Array  # (N, 3) in world
     second: Array  # (N, 3) in world
     sigma_m: Array  # (N, 3)
+    shared_m: float
+    shared_over: float
     heading_rad: Array | None = None
     crs_origin_m: tuple[float, float] | None = None
     latitude_rad: float | None = None
@@ -59,6 +62,10 @@ class Paired:
             raise ValueError(f"paired positions of shapes {shapes}: all must be (N, 3), headings (N,)")
         if not (np.isfinite(self.first).all() and np.isfinite(self.second).all() and (self.sigma_m > 0).all()):
             raise ValueError("paired positions must be finite, and their sigmas positive")
+
+    @property
+    def shared(self) -> Shared:
+        return Shared(self.shared_m, max(self.shared_over, 1e-9))
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,7 +120,7 @@ def _level(paired: Paired, fixed: Gross | None, sigma: Array) -> _Level:
         return _Level(gross_finding(paired, fixed, sigma), fixed.inlier)
     if fixed is not None and _far(fixed):
         return _Level(far_finding(paired, fixed), fixed.inlier, elsewhere=True)
-    small = explain(paired.second[:, :2] - paired.first[:, :2], sigma, _level_parts(paired))
+    small = explain(paired.second[:, :2] - paired.first[:, :2], sigma, paired.shared, _level_parts(paired))
     if small is not None and not _large(small):
         found = small.explanations
         return _Level(level_finding(paired, found) if found else None, small.inlier)
@@ -158,7 +165,9 @@ def _heights(paired: Paired, height: Gross | None, inlier: NDArray[np.bool_]) ->
         return [gross_finding(paired, height, paired.sigma_m[:, 2], heights=True)]
     difference, sigma = (paired.second[:, 2:] - paired.first[:, 2:])[inlier], paired.sigma_m[inlier, 2]
     above = paired.first[inlier, 2:] - np.median(paired.first[inlier, 2])
-    found = explain(difference, sigma, {"shift": np.ones((len(sigma), 1, 1)), "scale": above[:, :, None]})
+    found = explain(
+        difference, sigma, paired.shared, {"shift": np.ones((len(sigma), 1, 1)), "scale": above[:, :, None]}
+    )
     if found is None:
         return [unrelated_finding(paired.first_name, paired.second_name, "heights")]
     return [height_finding(paired, found.explanations)] if found.explanations else []
