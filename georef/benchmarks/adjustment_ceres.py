@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Literal, cast
 
 import numpy as np
 
@@ -50,7 +50,7 @@ def solve_with_ceres(
         _options(size, max_iterations, cost_tolerance, linear), config, model
     )
     ready = time.process_time()
-    done = adjuster.solve().ceres_summary
+    done = cast("pycolmap.CeresBundleAdjustmentSummary", adjuster.solve()).ceres_summary
     solved = time.process_time()
     iterations = done.num_successful_steps + done.num_unsuccessful_steps
     converged = done.termination_type.name == "CONVERGENCE"
@@ -149,7 +149,8 @@ def _camera(camera: Camera, number: int) -> pycolmap.Camera:
 
 def _state(block: Block, model: pycolmap.Reconstruction) -> State:
     first = block.mountings[0].rig_from_cam.inverse()
-    poses = [_from_colmap(model.frames[i + 1].rig_from_world).inverse() @ first for i in range(len(block.station_ids))]
+    placed = [model.frames[i + 1].rig_from_world for i in range(len(block.station_ids))]
+    poses = [_from_colmap(pose).inverse() @ first for pose in placed if pose is not None]
     points = np.array([model.points3D[i + 1].xyz for i in range(len(block.points))])
     cameras = []
     for number, calibration in enumerate(block.calibrations, start=1):

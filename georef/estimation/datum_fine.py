@@ -150,7 +150,7 @@ def _averaged(
 
     def whitened(rows: Array) -> Array:
         """Rows (G, d, q), those of one coordinate with each other."""
-        return np.linalg.solve(factor, rows.reshape(len(rows), -1)).reshape(len(rows) * d, -1)
+        return np.asarray(np.linalg.solve(factor, rows.reshape(len(rows), -1)), np.float64).reshape(len(rows) * d, -1)
 
     y = whitened(np.array(means)[:, :, None])[:, 0]
     return _Averaged(y, {name: whitened(np.array(column)) for name, column in columns.items()})
@@ -179,7 +179,7 @@ def _fit(averaged: _Averaged, names: tuple[str, ...]) -> tuple[float, int]:
 
 def _explanation(averaged: _Averaged, names: tuple[str, ...], statistic: float, noise: float) -> Explanation:
     design = np.concatenate([averaged.parts[name] for name in names], axis=1)
-    cov = np.linalg.pinv(design.T @ design, rcond=_RANK**2, hermitian=True)
+    cov = np.asarray(np.linalg.pinv(design.T @ design, rcond=_RANK**2, hermitian=True), np.float64)
     values = cov @ design.T @ averaged.y
     ends = np.cumsum([averaged.parts[name].shape[1] for name in names])
     slices = {name: slice(end - averaged.parts[name].shape[1], end) for name, end in zip(names, ends, strict=True)}

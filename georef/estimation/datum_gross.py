@@ -121,7 +121,7 @@ def _on_a_line(points: Array, sigma: Array) -> bool:
 
 def free_similarity(first: Array, second: Array, sigma: Array) -> Gross | None:
     """A similarity of the plane, proper or not, first to the stated noise and then to what other frames bend."""
-    a, b = first @ [1.0, 1j], second @ [1.0, 1j]
+    a, b = first[:, 0] + 1j * first[:, 1], second[:, 0] + 1j * second[:, 1]
     middle = np.median(a.real) + 1j * np.median(a.imag)
     for coarse in (False, True):
         results = [

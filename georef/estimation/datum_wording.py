@@ -2,42 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal
-
 import numpy as np
 
 from georef.estimation.datum_fine import Explanation
 from georef.estimation.datum_gross import FOOT_M, SURVEY_FOOT_M, Gross
+from georef.estimation.datum_types import Finding, Kind, Paired
 from georef.geometry.rigid import Array
 
-if TYPE_CHECKING:
-    from georef.estimation.datum_sentinel import Paired
-
-Kind = Literal[
-    *("height offset", "height scale", "heights reversed", "axes swapped", "handedness", "axes turned", "feet"),
-    *("wrong zone", "false origin", "antenna offset", "shift", "turn", "scale", "several", "unrelated", "undecided"),
-]
 _GEOID_M = (10.0, 110.0)  # sizes of undulations, so that smaller constants are not called so
 _FALSE_ORIGINS_M = (500_000.0, 1_000_000.0, 10_000_000.0)
 _EARTH_RADIUS_M = 6_371_000.0
 _ZONE_DEG = 6.0
 _LONGEST_ARM_M = 6.0  # an antenna farther off is on no vehicle
-
-
-@dataclass(frozen=True, eq=False)
-class Finding:
-    """A fault. value and sigma (q,): its size, metres, or radians, or parts; what they are is said in the text.
-
-    alternatives: other faults that would look the same in these positions.
-    """
-
-    kind: Kind
-    text: str
-    remedy: str
-    value: Array
-    sigma: Array
-    alternatives: tuple[str, ...] = ()
 
 
 _AXES: dict[str, tuple[Kind, str]] = {
