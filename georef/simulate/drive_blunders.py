@@ -63,14 +63,8 @@ def with_blunders(
     observations, wrong_observations = _single_observations(block, design, seed)
     poses = block.pose_priors
     there = Poses(poses.world_from_cam.rotation, poses.world_from_cam.translation + moved[pose_stretch])
-    wrong = Wrong(
-        wrong_observations,
-        pose_stretch >= 0,
-        pose_stretch,
-        (point_stretch >= 0) | single,
-        point_stretch,
-        shifts,
-    )
+    wrong_points = (point_stretch >= 0) | single
+    wrong = Wrong(wrong_observations, pose_stretch >= 0, pose_stretch, wrong_points, point_stretch, shifts)
     changed = replace(
         block,
         observations=replace(block.observations, pixel=observations),

@@ -111,13 +111,7 @@ def _poses(
     station = np.repeat(np.flatnonzero(kind == 0), design.poses_a_station)
     image = station * heads + np.tile(np.arange(design.poses_a_station), len(station) // design.poses_a_station)
     n = len(image)
-    sigma = np.concatenate(
-        [
-            np.repeat(np.radians(rng.uniform(*design.pose_deg, n))[:, None], 3, axis=1),
-            np.repeat(rng.uniform(*design.pose_m, n)[:, None], 3, axis=1),
-        ],
-        axis=1,
-    )
+    sigma = np.repeat([np.radians(rng.uniform(*design.pose_deg, n)), rng.uniform(*design.pose_m, n)], 3, axis=0).T
     correlation = np.eye(6)  # a camera that is turned too far to the right is put too far to the left
     correlation[1, 3] = correlation[3, 1] = -0.6
     correlation[0, 4] = correlation[4, 0] = 0.6
@@ -141,14 +135,7 @@ def _points(
     rng: np.random.Generator,
 ) -> tuple[PointPriors, NDArray[np.int64]]:
     """Automatic control points of the stretches that have them, and surveyed ones anywhere."""
-    order = rng.permutation(len(points))
-    here = order[kind[anchor[order]] == 1]
-    automatic = np.sort(here[: round(design.points_a_station * int((kind == 1).sum()))])
-    control = np.sort(
-        np.setdiff1d(order, automatic, assume_unique=True)[rng.permutation(len(points) - len(automatic))][
-            : design.control
-        ]
-    )
+    automatic, control = _chosen(design, kind, anchor, rng)
     n, m = len(automatic), len(control)
     sigma = rng.uniform(*design.point_m, n)[:, None] * rng.uniform(0.5, 1.5, (n, 3))
     axes = np.linalg.qr(rng.normal(size=(n, 3, 3)))[0] if n else np.zeros((0, 3, 3))
@@ -164,6 +151,17 @@ def _points(
     given = points[index] + np.concatenate([error, control_error])
     reference = np.concatenate([group[anchor[automatic]], np.full(m, _NO_STRETCH)])
     return PointPriors(index, given, information, which, names), reference
+
+
+def _chosen(
+    design: DrivePriors, kind: NDArray[np.int64], anchor: NDArray[np.int64], rng: np.random.Generator
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Points that are automatic control points, and others that are surveyed."""
+    order = rng.permutation(len(anchor))
+    here = order[kind[anchor[order]] == 1]
+    automatic = np.sort(here[: round(design.points_a_station * int((kind == 1).sum()))])
+    others = np.setdiff1d(order, automatic, assume_unique=True)
+    return automatic, np.sort(rng.permutation(others)[: design.control])
 
 
 def _positions(design: DrivePriors, route: Route, rng: np.random.Generator) -> tuple[PositionPriors, Array]:
