@@ -1,4 +1,4 @@
-"""The verbs `benchmark vectors`, `benchmark features` and `benchmark extraction`."""
+"""The verbs `benchmark vectors`, `benchmark features`, `benchmark extraction` and `benchmark adjustment`."""
 
 from __future__ import annotations
 
@@ -6,13 +6,15 @@ import json
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from cyclopts import App, Parameter, validators
 
 from georef.terminal import say
 
-benchmark = App(name="benchmark", help="Measure stores at the size of a city, and extractors; takes minutes.")
+benchmark = App(
+    name="benchmark", help="Measure stores at the size of a city, extractors and the adjustment; takes minutes."
+)
 
 Scratch = Annotated[Path | None, Parameter(help="Where to put gigabytes while measuring; else the system's own place.")]
 Output = Annotated[Path | None, Parameter(name=["--output", "-o"], help="JSON file with all figures.")]
@@ -61,6 +63,28 @@ def extraction(
     compared = compared_with_kornia(images, 2048)
     say(*as_table([compared.own, compared.shipped]), f"keypoints that are the same: {100 * compared.same_share:.2f} %")
     return 0
+
+
+@benchmark.command
+def adjustment(
+    *,
+    stations: Annotated[Count, Parameter(help="Stations of the simulated drive.")] = 1000,
+    cameras: Annotated[Literal[5, 11], Parameter(help="Cameras of its rig.")] = 5,
+    observations: Annotated[Count | None, Parameter(help="Image observations; else 200 an image.")] = None,
+    calibrations: Annotated[Literal["held", "free"], Parameter(help="Interior orientations.")] = "held",
+    ceres: Annotated[bool, Parameter(help="Adjust with pycolmap as well.")] = True,
+    linear: Annotated[
+        Literal["direct", "as pycolmap chooses"], Parameter(help="How Ceres solves the reduced equations.")
+    ] = "direct",
+    scratch: Scratch = None,
+    output: Output = None,
+) -> int:
+    """The bundle adjustment of a simulated drive beside pycolmap's: CPU-seconds, memory, cost, poses."""
+    from georef.benchmarks import adjustment as bench
+    from georef.benchmarks.adjustment_problem import Size
+
+    size = Size(stations, cameras, observations or 200 * stations * cameras, calibrations == "free")
+    return _measure(lambda folder: bench.run(size, folder, linear=linear, ceres=ceres), bench.describe, scratch, output)
 
 
 def _measure(

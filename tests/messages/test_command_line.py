@@ -39,6 +39,7 @@ VERBS = [
     "benchmark vectors",
     "benchmark features",
     "benchmark extraction",
+    "benchmark adjustment",
 ]
 GEOREF = [sys.executable, "-c", "from georef.cli import main; main()"]
 POSES = "# CRS: EPSG:25832, height: ellipsoidal, metres.\nimage,easting,northing,height,omega,phi,kappa\n"
