@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, cast
 
 import gtsam
 import numpy as np
@@ -154,12 +154,11 @@ def test_equal_to_gtsam_marginals() -> None:
     graph, values, size = gtsam.GaussianFactorGraph(), gtsam.VectorValues(), found.layout.size
     starts = [*range(0, 6 * found.layout.stations + 1, 6), *range(size, found.design.shape[1], 3)]
     ends = [*starts[1:], found.design.shape[1]]
-    unit = gtsam.noiseModel.Unit.Create(1)
+    unit, factor = gtsam.noiseModel.Unit.Create(1), cast(Any, gtsam.JacobianFactor)
     for residual, row in zip(found.residual, found.design, strict=True):
         terms = [(key, row[None, a:b]) for key, (a, b) in enumerate(zip(starts, ends, strict=True)) if row[a:b].any()]
         if terms:  # a station, the border and a point, or two stations
-            parts: list[Any] = [part for term in terms for part in term]
-            graph.add(gtsam.JacobianFactor(*parts, -residual[None], unit))
+            graph.add(factor(*(part for term in terms for part in term), -residual[None], unit))
     for key, (a, b) in enumerate(zip(starts, ends, strict=True)):
         values.insert(key, np.zeros(b - a))
     marginals = gtsam.Marginals(graph, values)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import pytest
@@ -43,7 +44,7 @@ def _world(
         observed[len(others) + begin : len(others) + end] += np.array(shift) / _POSE_M
     qvv = np.eye(len(sigma)) - design @ np.linalg.inv(design.T @ design) @ design.T
     mine = qvv[len(others) :]
-    information = np.kron(mine[:, len(others) :] / _POSE_M**2, np.eye(3))
+    information: Any = np.kron(mine[:, len(others) :] / _POSE_M**2, np.eye(3))
     right = (mine @ observed) / _POSE_M
     rows = np.arange(stations)
     return _World(_block(stations), ShiftSystem(information, right.ravel(), rows, rows))

@@ -48,7 +48,9 @@ def test_against_the_dense_network(solved: tuple[Block, State, dict[str, TermTes
                 assert np.isnan(found.detectable[k, axis])
                 continue
             row = [
-                i for i in dense.rows("points", k) if dense.design[i, dense.point[block.point_priors.point[k]] + axis]
+                i
+                for i in dense.rows("points", k)
+                if dense.design[i, int(dense.point[block.point_priors.point[k]]) + axis]
             ]
             assert len(row) == 1
             number = qvv[row[0], row[0]]

@@ -20,13 +20,12 @@ from georef.estimation.adjustment.coherent import CoherentBlock, CoherentSearch,
 from georef.estimation.adjustment.components import Component
 from georef.estimation.adjustment.constraint_terms import DISTANCES, POSE_PRIORS, POSITION_PRIORS, RELATIVE_POSES
 from georef.estimation.adjustment.datum import explain_singular
-from georef.estimation.adjustment.eliminate import IMAGE_OBSERVATIONS, normal_equations
+from georef.estimation.adjustment.eliminate import IMAGE_OBSERVATIONS, Linearized, normal_equations
 from georef.estimation.adjustment.group_tests import ImageTests, TermTests, components, constraint_tests, image_tests
 from georef.estimation.adjustment.prepared import Prepared
 from georef.estimation.adjustment.reference_part import ReferencePart
 from georef.estimation.adjustment.shift_system import pose_shifts
 from georef.estimation.adjustment.solver import BlockSolution, SolverOptions, solve_block
-from georef.geometry.rigid import Array
 
 _GATE_ROUNDS, _ROBUST_ROUNDS = 3, 2
 _FAR_OFF = 1.25  # of a sigma against its residuals
@@ -54,10 +53,9 @@ class BlockOptions:
 
 @dataclass(frozen=True, eq=False)
 class Quality:
-    """Cofactors and tests of a block at a state. gradient (6 S + B,): of the reduced normal equations there."""
+    """Cofactors and tests of a block at a state."""
 
     cofactors: Cofactors
-    gradient: Array
     images: ImageTests
     constraints: list[TermTests]
     components: dict[str, Component]
@@ -113,20 +111,25 @@ def adjust_block(block: Block, options: BlockOptions) -> AdjustedBlock:
 
 
 def quality(block: Block, state: State) -> Quality:
-    """Cofactors, tests and variance components at a state, for the stated sigmas. Raises GeorefError."""
+    """Cofactors, tests and variance components at a state, for the stated sigmas. Raises GeorefError where the normal
+    equations are singular."""
     prepared = Prepared.of(block)
     lin = normal_equations(block, state, prepared=prepared)
-    try:
-        found = cofactors(lin.reduced)
-    except SingularMatrix:
-        words = explain_singular(block, state, lin.reduced)
-        raise GeorefError(
-            words or "The adjustment has no unique solution: its constraints leave a datum open."
-        ) from None
+    found = _inverted(block, state, lin)
     images = image_tests(block, state, found, prepared)
     references = ReferencePart.of(block, state, found)
     tests = constraint_tests(block, state, found, images.points, references)
-    return Quality(found, lin.reduced.gradient, images, tests, components(block, state, images, tests), references)
+    return Quality(found, images, tests, components(block, state, images, tests), references)
+
+
+def _inverted(block: Block, state: State, lin: Linearized) -> Cofactors:
+    try:
+        return cofactors(lin.reduced)
+    except SingularMatrix:
+        words = explain_singular(block, state, lin.reduced)
+        raise GeorefError(
+            words or "The adjustment has no unique solution: its constraints leave unknowns open."
+        ) from None
 
 
 def _robust(block: Block, state: State, options: BlockOptions) -> tuple[Block, State, float]:
@@ -157,8 +160,11 @@ def _gate_images(block: Block, state: State, found: Quality, probability: float)
 
 
 def _coherent(block: Block, state: State, options: BlockOptions) -> CoherentSearch:
-    found = quality(block, state)
-    system = pose_shifts(block, state, found.cofactors, found.gradient)
+    """Wrong stretches of poses at the robust solution: poses with their full weight, all else with that of its loss, so
+    that its single blunders do not bend the network."""
+    losses = {kind: scale for kind, scale in options.losses.items() if kind != POSE_PRIORS}
+    lin = normal_equations(block, state, losses=losses)
+    system = pose_shifts(block, state, _inverted(block, state, lin), lin.reduced.gradient)
     if system is None:
         return CoherentSearch((), False)
     return coherent_blocks(block, system, reference_m=options.reference_m)
