@@ -72,8 +72,8 @@ def write_bingo(table: BingoTable, path: Path | str) -> None:
     lines: list[str] = []
     for index, name in enumerate(table.image_ids):
         lines.append(f"{name} {table.cameras[index]}".rstrip())
-        for i in order[starts[index] : starts[index + 1]]:
-            lines.append(f"{table.point_ids[table.point[i]]} {table.xy_mm[i, 0]:.5f} {table.xy_mm[i, 1]:.5f}")
+        rows = order[starts[index] : starts[index + 1]]
+        lines += [f"{table.point_ids[table.point[i]]} {table.xy_mm[i, 0]:.5f} {table.xy_mm[i, 1]:.5f}" for i in rows]
         lines.append(_END)
     write_text_atomically("\n".join(lines) + "\n", path)
 

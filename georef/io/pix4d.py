@@ -8,7 +8,6 @@ model `brown` (R1, R2, R3 = k1, k2, k3; T1, T2 = p1, p2). Angles are omega-phi-k
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -24,21 +23,35 @@ from georef.io.gnss import GnssTable, read_gnss
 from georef.io.tables import read_table
 
 POSE_COLUMNS = {
-    **{"image": "imageName", "camera": "cameraName", "easting": "X", "northing": "Y", "height": "Z"},
-    **{"omega": "Omega", "phi": "Phi", "kappa": "Kappa"},
+    "image": "imageName",
+    "camera": "cameraName",
+    "easting": "X",
+    "northing": "Y",
+    "height": "Z",
+    "omega": "Omega",
+    "phi": "Phi",
+    "kappa": "Kappa",
 }
 """Of `*_calibrated_external_camera_parameters.txt`."""
 
 ADJUSTED_COLUMNS = POSE_COLUMNS | {
-    **{"easting": "X_opt", "northing": "Y_opt", "height": "Z_opt"},
-    **{"sigma_e": "X_uncertainty", "sigma_n": "Y_uncertainty", "sigma_h": "Z_uncertainty"},
+    "easting": "X_opt",
+    "northing": "Y_opt",
+    "height": "Z_opt",
+    "sigma_e": "X_uncertainty",
+    "sigma_n": "Y_uncertainty",
+    "sigma_h": "Z_uncertainty",
     **{f"sigma_{name}": f"{name.capitalize()}_uncertainty" for name in ("omega", "phi", "kappa")},
 }
 """Poses as adjusted, of `*_calibrated_external_camera_parameters_error.txt`."""
 
 GIVEN_COLUMNS = POSE_COLUMNS | {
-    **{"easting": "X_gps", "northing": "Y_gps", "height": "Z_gps"},
-    **{"sigma_e": "X_acc", "sigma_n": "Y_acc", "sigma_h": "Z_acc"},
+    "easting": "X_gps",
+    "northing": "Y_gps",
+    "height": "Z_gps",
+    "sigma_e": "X_acc",
+    "sigma_n": "Y_acc",
+    "sigma_h": "Z_acc",
 }
 """Positions as measured, of the same file."""
 
@@ -174,11 +187,6 @@ def read_pix4d_correlations(path: Path | str) -> tuple[tuple[str, ...], Array]:
             path=path,
         )
     return names, np.array(rows)
-
-
-def image_keys(image_ids: Mapping[str, object] | tuple[str, ...]) -> dict[str, str]:
-    """Image ids without the ending of their file -> the ids: other exports of a block name images so."""
-    return {re.sub(r"\.[A-Za-z]{3,4}$", "", name): name for name in image_ids}
 
 
 def _first_image(lines: list[str]) -> int:
