@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import cast
 
 import numpy as np
 
@@ -184,7 +185,8 @@ def _mountings(
                 path=path,
             )
     mountings = tuple(
-        RigCamera(name, m.rig_from_cam, None if m.cov is None else np.linalg.inv(m.cov)) for name, m in rig.items()
+        RigCamera(name, m.rig_from_cam, None if m.cov is None else cast(Array, np.linalg.inv(m.cov)))
+        for name, m in rig.items()
     )
     return mountings, np.array([index[camera.camera_id] for camera in cameras], dtype=np.int64)
 
@@ -195,8 +197,8 @@ def _antennas(section: BlockSection) -> tuple[tuple[Antenna, ...], Array]:
     if gnss is None:
         return (), np.zeros((0, 3, 3))
     sigma = gnss.lever_arm_sigma_m
-    information = None if sigma is None else np.diag(np.array(sigma, dtype=np.float64) ** -2.0)
-    antenna = Antenna("antenna", np.array(gnss.lever_arm_m), information)
+    weights = None if sigma is None else np.square(1.0 / np.array(sigma))
+    antenna = Antenna("antenna", np.array(gnss.lever_arm_m), None if weights is None else np.diag(weights))
     offset = gnss.offset_sigma_m
     drift = np.zeros((0, 3, 3)) if offset is None else np.diag(np.square(1.0 / np.array(offset)))[None]
     return (antenna,), drift

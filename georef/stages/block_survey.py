@@ -232,7 +232,7 @@ def _block(started: Block, ties: Observations, tie_ids: tuple[str, ...]) -> tupl
     cameras = [started.calibrations[c].camera for c in started.calibration]
     views = Views.of(world_from_cam.to_list(), cameras)
     found = triangulate(views, ties.point, ties.view, ties.pixel, ties.sigma_px, len(tie_ids))
-    good: NDArray[np.bool_] = np.isfinite(found.points).all(axis=1)
+    good = np.isfinite(found.points[:, 0])
     number = np.cumsum(good) - 1
     kept = ties.take(good[ties.point])
     block = replace(started, points=found.points[good], observations=kept.with_points(number[kept.point]))
