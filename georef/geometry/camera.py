@@ -110,6 +110,17 @@ class Camera:
         distortion = tuple(float(v) for v in coefficients[:count])
         return replace(self, fx=self.fx * factor, fy=self.fy * factor * stretch, cx=cx, cy=cy, distortion=distortion)
 
+    def steps_since(self, given: Camera, names: Sequence[str]) -> Array:
+        """The steps (q,) of the named ones of ESTIMABLE that lead from a given camera to this one: the inverse of
+        `given.changed`."""
+        out = np.empty(len(names))
+        for i, name in enumerate(names):
+            if name in ("focal", "aspect"):
+                out[i] = np.log(self.value(name) / given.value(name))
+            else:
+                out[i] = (self.value(name) - given.value(name)) / given.unit(name)
+        return out
+
 
 def project(camera: Camera, points_in_cam: ArrayLike) -> Array:
     """Observed pixels (N, 2) of points (N, 3) in the camera frame; NaN for points that the lens does not show.

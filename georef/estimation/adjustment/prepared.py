@@ -1,0 +1,206 @@
+"""What stays the same over the iterations of a block: the order of observations, the pattern of station pairs."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from georef.estimation.adjustment.block import Block, Indices, State
+from georef.estimation.adjustment.kernels import (
+    ASPECT,
+    CENTRE_X,
+    CENTRE_Y,
+    FIRST_COEFFICIENT,
+    FOCAL,
+    Images,
+    Placed,
+    kernel,
+)
+from georef.estimation.adjustment.kernels_points import Tracks, Work, work_for
+from georef.estimation.adjustment.reduced import Layout
+from georef.geometry.camera import Camera
+from georef.geometry.poses import Poses
+from georef.geometry.projection import MODEL_NAMES
+
+_CODES = {"focal": FOCAL, "aspect": ASPECT, "cx": CENTRE_X, "cy": CENTRE_Y}
+
+
+@dataclass(frozen=True, eq=False)
+class Prepared:
+    """A block in the order of its kernels. `order` (n,): which observation of the block each row of `tracks` is.
+
+    `first` and `column` are the pattern of `Reduced`: pairs of stations that share a point or a constraint.
+    """
+
+    layout: Layout
+    tracks: Tracks
+    images: Images
+    order: NDArray[np.int64]
+    first: Indices
+    column: Indices
+
+    @staticmethod
+    def of(block: Block) -> Prepared:
+        layout = Layout.of(block)
+        order, points, start = _sorted_by_point(block)
+        prior_row = np.full(len(block.points), -1)
+        prior_row[block.point_priors.point] = np.arange(len(block.point_priors))
+        obs = block.observations
+        tracks = Tracks(
+            point=points,
+            start=start,
+            image=obs.view[order].astype(np.int32),
+            pixel=obs.pixel[order],
+            weight=1.0 / obs.sigma_px[order],
+            kept=layout.kept_point[points],
+            prior=prior_row[points],
+        )
+        stations = block.station.astype(np.int32)
+        tied = np.stack([block.relative_poses.a, block.relative_poses.b], axis=1)
+        first, column = station_pairs(tracks, stations, layout, np.sort(tied, axis=1))
+        return Prepared(layout, tracks, _images(block, layout), order, first, column)
+
+    def work(self) -> Work:
+        longest = int(np.diff(self.tracks.start).max(initial=0))
+        return work_for(longest, 6 + self.images.code.shape[1] + 3, self.layout.border)
+
+
+def placed(state: State) -> Placed:
+    """The stations, mountings and calibrations of a state as the kernels take them."""
+    rig_from_world, cam_from_rig = state.world_from_rig.inverse(), state.rig_from_cam.inverse()
+    return Placed(
+        *_arrays(rig_from_world),
+        *_arrays(cam_from_rig),
+        np.array([MODEL_NAMES.index(c.model) for c in state.cameras], dtype=np.int64),
+        np.array([c.parameters for c in state.cameras], dtype=np.float64),
+    )
+
+
+def _arrays(poses: Poses) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    return np.ascontiguousarray(poses.rotation), np.ascontiguousarray(poses.translation)
+
+
+def code_of(camera: Camera, name: str) -> int:
+    """The kernels' number of one of ESTIMABLE."""
+    return _CODES[name] if name in _CODES else FIRST_COEFFICIENT + camera.lens.parameters.index(name)
+
+
+def _images(block: Block, layout: Layout) -> Images:
+    names = [[code_of(c.camera, name) for name in c.camera.estimate] for c in block.calibrations]
+    most = max((len(row) for row in names), default=0)
+    return Images(
+        station=block.station.astype(np.int32),
+        mounting=block.mounting.astype(np.int32),
+        calibration=block.calibration.astype(np.int32),
+        mounting_column=layout.mounting.astype(np.int64),
+        calibration_column=layout.calibration.astype(np.int64),
+        code=np.array([row + [0] * (most - len(row)) for row in names], dtype=np.int64).reshape(len(names), most),
+        unknowns=np.array([len(row) for row in names], dtype=np.int64),
+    )
+
+
+def _sorted_by_point(block: Block) -> tuple[NDArray[np.int64], NDArray[np.int32], NDArray[np.int64]]:
+    """Observations point by point, within a point by station; points by their first station, so that what one pass
+    touches lies together. Points without observations or prior are left out."""
+    obs = block.observations
+    by_station = np.argsort(block.station, kind="stable")
+    rank = np.empty_like(by_station)
+    rank[by_station] = np.arange(len(by_station))
+    order = counting_order(rank[obs.view], len(rank))
+    first_station = np.full(len(block.points), len(block.station_ids))
+    first_station[obs.point[order[::-1]]] = block.station[obs.view[order[::-1]]]
+    by_place = np.argsort(first_station, kind="stable")
+    counts = np.bincount(obs.point, minlength=len(block.points))
+    needed = counts > 0
+    needed[block.point_priors.point] = True
+    points = by_place[needed[by_place]]
+    rank_of_point = np.zeros(len(block.points), np.int64)
+    rank_of_point[points] = np.arange(len(points))
+    order = order[counting_order(rank_of_point[obs.point[order]], len(points))]
+    start = np.concatenate([[0], np.cumsum(counts[points])])
+    return order, points.astype(np.int32), start
+
+
+@kernel
+def counting_order(key, count):
+    """Stable order of keys (n,) in 0 .. count - 1."""
+    start = np.zeros(count + 1, np.int64)
+    for k in key:
+        start[k + 1] += 1
+    for k in range(count):
+        start[k + 1] += start[k]
+    order = np.empty(key.shape[0], np.int64)
+    for i in range(key.shape[0]):
+        order[start[key[i]]] = i
+        start[key[i]] += 1
+    return order
+
+
+def station_pairs(
+    tracks: Tracks, station: NDArray[np.int32], layout: Layout, tied: Indices
+) -> tuple[Indices, Indices]:
+    """The pattern (first, column) of `Reduced`; tied (K, 2): further pairs, the smaller station first."""
+    at_station, track, slot = _incidence(tracks.start, tracks.image, tracks.kept, station)
+    by_station = counting_order(at_station, layout.stations)
+    begin = np.searchsorted(at_station[by_station], np.arange(layout.stations + 1))
+    tied = tied[np.argsort(tied[:, 0], kind="stable")]
+    tied_begin = np.searchsorted(tied[:, 0], np.arange(layout.stations + 1))
+    first, found = _pairs(
+        begin, by_station, at_station, track, slot, tied_begin, np.ascontiguousarray(tied[:, 1]), layout.stations
+    )
+    return first, found
+
+
+@kernel
+def _incidence(start, image, kept, station):
+    """All (station, track) pairs, by track: station (m,), track (m,), and the end of the track's own pairs (m,)."""
+    total = 0
+    for track in range(start.shape[0] - 1):
+        last = -1
+        for at in range(start[track], start[track + 1]):
+            if station[image[at]] != last and kept[track] < 0:
+                last = station[image[at]]
+                total += 1
+    stations, tracks, ends = np.empty(total, np.int64), np.empty(total, np.int32), np.empty(total, np.int64)
+    m = 0
+    for track in range(start.shape[0] - 1):
+        last, begin = -1, m
+        for at in range(start[track], start[track + 1]):
+            if station[image[at]] != last and kept[track] < 0:
+                last = station[image[at]]
+                stations[m], tracks[m] = last, track
+                m += 1
+        ends[begin:m] = m
+    return stations, tracks, ends
+
+
+@kernel
+def _pairs(begin, by_station, at_station, track, end, tied_begin, tied, stations):
+    """Rows of rising columns from pairs at the same track, and tied ones."""
+    seen = np.full(stations, -1)
+    first = np.zeros(stations + 1, np.int64)
+    column = np.empty(16 * stations + 16, np.int64)
+    total = 0
+    for row in range(stations):
+        if total + stations + 1 > column.shape[0]:
+            grown = np.empty(2 * column.shape[0] + stations, np.int64)
+            grown[:total] = column[:total]
+            column = grown
+        column[total], seen[row] = row, row
+        total += 1
+        for k in range(begin[row], begin[row + 1]):
+            m = by_station[k]
+            for other in range(m + 1, end[m]):
+                there = at_station[other]
+                if seen[there] != row:
+                    seen[there], column[total] = row, there
+                    total += 1
+        for k in range(tied_begin[row], tied_begin[row + 1]):
+            if seen[tied[k]] != row:
+                seen[tied[k]], column[total] = row, tied[k]
+                total += 1
+        column[first[row] + 1 : total].sort()
+        first[row + 1] = total
+    return first, column[:total].copy()
