@@ -1,7 +1,8 @@
 """Camera models: pixels <-> rays.
 
 `pinhole` has (fx, fy, cx, cy); `brown` adds (k1, k2, p1, p2[, k3]), the model of COLMAP's OPENCV and gtsam's Cal3DS2;
-`fisheye` is equidistant with (k1, k2, k3, k4), OPENCV_FISHEYE and Cal3Fisheye, to beyond 90 degrees from the axis.
+`rational` adds (k1, k2, p1, p2, k3, k4, k5, k6), FULL_OPENCV; `fisheye` is equidistant with (k1, k2, k3, k4),
+OPENCV_FISHEYE and Cal3Fisheye, to beyond 90 degrees from the axis.
 Pixels are of the full-resolution image, the centre of the top-left pixel is (0.5, 0.5). Estimation works on pixels as
 they were observed: their noise is the same in all directions there, and only there.
 """
@@ -16,13 +17,16 @@ from typing import Literal, cast
 import numpy as np
 from numpy.typing import ArrayLike
 
-from georef.geometry.lenses import COEFFICIENTS, MODELS, LensModel, undistort
+from georef.geometry.lens_slopes import undistort
+from georef.geometry.lenses import COEFFICIENTS, MODELS, LensModel
 from georef.geometry.rigid import Array
 
-CameraModel = Literal["pinhole", "brown", "fisheye"]
-ESTIMABLE = ("focal", "k1", "k2", "cx", "cy", "aspect")
+CameraModel = Literal["pinhole", "brown", "fisheye", "rational"]
+PLAIN = ("focal", "cx", "cy", "aspect")
+ESTIMABLE = ("focal", "k1", "k2", "cx", "cy", "aspect", "p1", "p2", "k3", "k4", "k5", "k6")
 """What can be estimated of a camera together with a pose, all without unit: steps of focal are those of the logarithm
-of a factor on fx and fy, of aspect on fy alone, steps of cx and cy are in units of fx."""
+of a factor on fx and fy, of aspect on fy alone, steps of cx and cy are in units of fx. PLAIN ones all cameras have,
+coefficients those whose model has them."""
 
 
 @dataclass(frozen=True)
@@ -30,7 +34,8 @@ class Camera:
     """Interior orientation, all in pixels of the full-resolution image.
 
     distortion: the coefficients of the model, (k1, k2, p1, p2) or (k1, k2, p1, p2, k3) of brown, (k1, k2, k3, k4) of
-    fisheye; missing ones are zero. A model that is not named follows from them: brown with, pinhole without.
+    fisheye, (k1, k2, p1, p2, k3, k4, k5, k6) of rational; missing ones are zero. A model that is not named follows
+    from what is given or estimated: brown with coefficients, pinhole without.
     estimate: which of ESTIMABLE are not known; their values here are where the estimation starts.
     """
 
@@ -46,13 +51,16 @@ class Camera:
     estimate: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        has_distortion = self.distortion or {"k1", "k2"} & set(self.estimate)
+        has_distortion = self.distortion or set(self.estimate) & set(MODELS["brown"].parameters)
         if self.model == "pinhole" and has_distortion:
             object.__setattr__(self, "model", "brown")
         if self.model not in MODELS or len(self.distortion) > len(MODELS[self.model].parameters):
             raise ValueError(f"camera {self.camera_id!r}: {self.model} has no {len(self.distortion)} coefficients")
         if set(self.estimate) - set(ESTIMABLE):
             raise ValueError(f"camera {self.camera_id!r}: only {', '.join(ESTIMABLE)} can be estimated")
+        foreign = [name for name in self.estimate if name not in (*PLAIN, *self.lens.parameters)]
+        if foreign:
+            raise ValueError(f"camera {self.camera_id!r}: {self.model} has no {foreign[0]} to be estimated")
 
     @property
     def lens(self) -> LensModel:
@@ -60,17 +68,17 @@ class Camera:
 
     @property
     def coefficients(self) -> Array:
-        """The coefficients (5,) of the model, zeros where there are fewer."""
+        """The coefficients (8,) of the model, zeros where there are fewer."""
         return np.array([*self.distortion, *[0.0] * (COEFFICIENTS - len(self.distortion))])
 
     @cached_property
     def limit(self) -> float:
-        """Up to where the model has an inverse: the tangent (pinhole, brown) or angle (fisheye) from the axis."""
+        """Up to where the model has an inverse: the angle from the axis of a fisheye, of the others its tangent."""
         return self.lens.limit(self.coefficients)
 
     @cached_property
     def parameters(self) -> Array:
-        """All of them in one row (10,): fx, fy, cx, cy, five coefficients, limit."""
+        """All of them in one row (13,): fx, fy, cx, cy, eight coefficients, limit."""
         return np.array([self.fx, self.fy, self.cx, self.cy, *self.coefficients, self.limit])
 
     @property
@@ -106,7 +114,9 @@ class Camera:
         cx, cy = self.cx + self.fx * steps.pop("cx", 0.0), self.cy + self.fx * steps.pop("cy", 0.0)
         coefficients, count = self.coefficients, max(len(self.distortion), 4 if steps else 0)
         for name, change in steps.items():
-            coefficients[self.lens.parameters.index(name)] += change
+            index = self.lens.parameters.index(name)
+            coefficients[index] += change
+            count = max(count, index + 1)
         distortion = tuple(float(v) for v in coefficients[:count])
         return replace(self, fx=self.fx * factor, fy=self.fy * factor * stretch, cx=cx, cy=cy, distortion=distortion)
 
@@ -125,7 +135,7 @@ class Camera:
 def project(camera: Camera, points_in_cam: ArrayLike) -> Array:
     """Observed pixels (N, 2) of points (N, 3) in the camera frame; NaN for points that the lens does not show.
 
-    Those are points that are not in front (pinhole, brown), and directions beyond the one at which the distortion
+    Those are points that are not in front (not of a fisheye), and directions beyond the one at which the distortion
     folds the image back on itself.
     """
     points = np.asarray(points_in_cam, dtype=np.float64)
@@ -136,7 +146,7 @@ def project(camera: Camera, points_in_cam: ArrayLike) -> Array:
 def rays_from_pixels(camera: Camera, pixels: ArrayLike) -> Array:
     """Viewing directions (N, 3) in the camera frame of observed pixels (N, 2), to 1e-9 px; NaN where there is none.
 
-    Scaled to z = 1 of pinhole and brown cameras, to unit length of fisheye ones.
+    Scaled to unit length of fisheye cameras, to z = 1 of all others.
     """
     image = (np.asarray(pixels, dtype=np.float64) - [camera.cx, camera.cy]) / [camera.fx, camera.fy]
     return camera.lens.rays(image, camera.coefficients, np.asarray(camera.limit))
@@ -175,8 +185,9 @@ def ideal_from_observed(camera: Camera, pixels: ArrayLike) -> Array:
     """Distortion-free pixels (N, 2) of the same calibration matrix, from observed pixels (N, 2), for undistorted
     pictures.
 
-    Beyond the radius at which a strong negative k1 folds the image back on itself the result is finite, and `project`
-    does not return the pixel. NaN for rays of a fisheye that are not in front of the camera.
+    Beyond the radius at which a strong negative k1 of brown folds the image back on itself the result is finite, and
+    `project` does not return the pixel. NaN for pixels that a rational lens does not show, and for rays of a fisheye
+    that are not in front of the camera.
     """
     observed = np.asarray(pixels, dtype=np.float64)
     if camera.model == "pinhole":

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from georef.geometry.camera import Camera
-from georef.geometry.lenses import MODELS, LensModel
+from georef.geometry.lenses import COEFFICIENTS, MODELS, LensModel
 from georef.geometry.rigid import Array, Rigid3, skew
 
 MODEL_NAMES = tuple(MODELS)
@@ -22,7 +22,7 @@ class Views:
     rotation: Array  # (V, 3, 3) cam_from_world
     translation: Array  # (V, 3) cam_from_world
     model: NDArray[np.int64]  # (V,) index in MODEL_NAMES
-    parameters: Array  # (V, 10): fx, fy, cx, cy, coefficients, limit
+    parameters: Array  # (V, 13): fx, fy, cx, cy, eight coefficients, limit
 
     @staticmethod
     def of(world_from_cams: Sequence[Rigid3], cameras: Sequence[Camera]) -> Views:
@@ -31,7 +31,7 @@ class Views:
             np.array([pose.rotation for pose in inverse]).reshape(-1, 3, 3),
             np.array([pose.translation for pose in inverse]).reshape(-1, 3),
             np.array([MODEL_NAMES.index(c.model) for c in cameras], dtype=np.int64),
-            np.array([c.parameters for c in cameras], dtype=np.float64).reshape(-1, 10),
+            np.array([c.parameters for c in cameras], dtype=np.float64).reshape(-1, 5 + COEFFICIENTS),
         )
 
     def __len__(self) -> int:
@@ -52,7 +52,7 @@ class Views:
         image = (pixels - k[:, 2:4]) / k[:, :2]
         in_cam = np.empty((len(image), 3))
         for lens, here in self._by_lens(view):
-            in_cam[here] = lens.rays(image[here], k[here, 4:9], k[here, 9])
+            in_cam[here] = lens.rays(image[here], k[here, 4:-1], k[here, -1])
         in_cam /= np.linalg.norm(in_cam, axis=1, keepdims=True)
         return np.einsum("nji,nj->ni", self.rotation[view], in_cam)
 
@@ -61,7 +61,7 @@ class Views:
         in_cam, k = self.to_cam(view, points), self.parameters[view]
         image = np.empty((len(in_cam), 2))
         for lens, here in self._by_lens(view):
-            image[here] = lens.project(in_cam[here], k[here, 4:9], k[here, 9])
+            image[here] = lens.project(in_cam[here], k[here, 4:-1], k[here, -1])
         return image * k[:, :2] + k[:, 2:4]
 
     def project_with_derivatives(self, view: NDArray[np.integer], in_cam: Array) -> tuple[Array, Array]:
@@ -69,7 +69,7 @@ class Views:
         k = self.parameters[view]
         image, by_cam = np.empty((len(in_cam), 2)), np.empty((len(in_cam), 2, 3))
         for lens, here in self._by_lens(view):
-            image[here], by_cam[here], _ = lens.derivatives(in_cam[here], k[here, 4:9], k[here, 9])
+            image[here], by_cam[here], _ = lens.derivatives(in_cam[here], k[here, 4:-1], k[here, -1])
         return image * k[:, :2] + k[:, 2:4], by_cam * k[:, :2, None]
 
     def _by_lens(self, view: NDArray[np.integer]) -> Iterator[tuple[LensModel, NDArray[np.bool_] | slice]]:

@@ -8,32 +8,32 @@ from typing import cast
 
 import numpy as np
 
-from georef.geometry.camera import ESTIMABLE, Camera, CameraModel
+from georef.geometry.camera import ESTIMABLE, PLAIN, Camera, CameraModel
 from georef.geometry.lenses import MODELS
 from georef.geometry.rigid import Array
 from georef.io.tables import Table, TableFormat, read_table
 
 CAMERA_COLUMNS = ("camera", "width", "height", "fx", "fy", "cx", "cy")
-COEFFICIENT_COLUMNS = ("k1", "k2", "p1", "p2", "k3", "k4")
+COEFFICIENT_COLUMNS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 DEFAULT_FOCAL = 1.2
 """Of the longer side: where an unknown focal length starts, a view of 45 degrees."""
-_OF_BROWN, _OF_FISHEYE = ("k1", "k2", "p1", "p2", "k3"), ("k1", "k2", "k3", "k4")
-_UNSUPPORTED = ("k5", "k6", "p3", "p4", "b1", "b2", "skew")
+_UNSUPPORTED = ("p3", "p4", "b1", "b2", "skew")
+_MODELS = "pinhole: no distortion; brown: k1, k2, p1, p2, k3; fisheye: k1, k2, k3, k4; rational: k1 to k6, p1, p2."
 _SHORTEST_FOCAL = 0.1  # of the longer side: a fisheye of more than 360 degrees
 
 
 def read_cameras(
     path: Path | str, *, columns: Mapping[str, str] | None = None, table_format: TableFormat | None = None
 ) -> dict[str, Camera]:
-    """Read camera, width, height, fx, fy, cx, cy and optionally model, k1 to k4, p1, p2, estimate -> id: Camera.
+    """Read camera, width, height, fx, fy, cx, cy and optionally model, k1 to k6, p1, p2, estimate -> id: Camera.
 
-    Pixels; the centre of the top-left pixel is (0.5, 0.5). model: pinhole, brown (k1, k2, p1, p2, k3) or fisheye
-    (equidistant, k1 to k4); without it brown where a coefficient is not zero, pinhole elsewhere. estimate: which of
-    focal, k1, k2, cx, cy, aspect (fy / fx) are not known, "focal k1"; their values are then where the estimation
-    starts. Of a camera of unknown focal length fx, fy (they start at 1.2 of the longer side) and the principal point
-    may be left out: what is, is estimated. Raises InputError for columns that are missing, values that cannot be
-    (sizes, focal lengths, a principal point outside the image), coefficients that the model does not have, and cameras
-    that are listed twice.
+    Pixels; the centre of the top-left pixel is (0.5, 0.5). model: pinhole, brown (k1, k2, p1, p2, k3), fisheye
+    (equidistant, k1 to k4) or rational (k1 to k6, p1, p2); without it brown where a coefficient is not zero, pinhole
+    elsewhere. estimate: which of focal, cx, cy, aspect (fy / fx) and the model's coefficients are not known, "focal
+    k1"; their values are then where the estimation starts. Of a camera of unknown focal length fx, fy (they start at
+    1.2 of the longer side) and the principal point may be left out: what is, is estimated. Raises InputError for
+    columns that are missing, values that cannot be (sizes, focal lengths, a principal point outside the image),
+    coefficients that the model does not have, and cameras that are listed twice.
     """
     table = read_table(path, columns=columns, table_format=table_format)
     unknown = _unknown(table)
@@ -45,6 +45,7 @@ def read_cameras(
     principal = _or_start(table, ("cx", "cy"), unknown, sizes / 2.0)
     models, coefficients = _models(table), _coefficients(table)
     _refuse_unsupported(table, models, coefficients)
+    _refuse_unknown_of_others(table, models, unknown)
     _check_focal_lengths(table, ids, sizes, focal)
     _check_principal_points(table, ids, sizes, principal)
     return {
@@ -68,7 +69,7 @@ def _models(table: Table) -> list[CameraModel]:
     unknown = _unknown(table)
     return [
         cast(CameraModel, name)
-        or ("brown" if any(v[i] for v in values.values()) or {"k1", "k2"} & set(unknown[i]) else "pinhole")
+        or ("brown" if any(v[i] for v in values.values()) or set(unknown[i]) - set(PLAIN) else "pinhole")
         for i, name in enumerate(named)
     ]
 
@@ -80,8 +81,7 @@ def _coefficients(table: Table) -> dict[str, Array]:
 
 
 def _distortion(model: CameraModel, values: Mapping[str, float]) -> tuple[float, ...]:
-    names = {"pinhole": (), "brown": _OF_BROWN, "fisheye": _OF_FISHEYE}[model]
-    distortion = tuple(values.get(name, 0.0) for name in names)
+    distortion = tuple(values.get(name, 0.0) for name in MODELS[model].parameters)
     if model == "brown" and distortion[4] == 0.0:
         return distortion[:4]
     return distortion
@@ -128,8 +128,23 @@ def _refuse_unsupported(table: Table, models: list[CameraModel], coefficients: M
             raise table.error(
                 int(i),
                 f"Column {name!r} has {values[i]}, which the camera model {models[i]!r} does not have.",
-                expected="pinhole: no distortion; brown: k1, k2, p1, p2, k3; fisheye: k1, k2, k3, k4.",
+                expected=_MODELS,
                 remedy=f"Calibrate with {name} fixed at 0, or name the right model in a column 'model'.",
+            )
+
+
+def _refuse_unknown_of_others(table: Table, models: list[CameraModel], unknown: list[tuple[str, ...]]) -> None:
+    """Coefficients that are to be estimated and that the model does not have."""
+    for i, names in enumerate(unknown):
+        for name in names:
+            model = "brown" if models[i] == "pinhole" else models[i]  # which an unknown distortion makes of it
+            if name in PLAIN or name in MODELS[model].parameters:
+                continue
+            raise table.error(
+                i,
+                f"Column 'estimate' has {name!r}, which the camera model {model!r} does not have.",
+                expected=_MODELS,
+                remedy=f"Leave {name} out, or name the right model in a column 'model'.",
             )
 
 

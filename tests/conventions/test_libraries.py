@@ -24,9 +24,20 @@ _PINHOLE = Camera("pinhole", 4000, 3000, 2510.0, 2495.0, 2003.5, 1496.5)
 _BROWN = Camera("brown", 4000, 3000, 2510.0, 2495.0, 2003.5, 1496.5, (-0.12, 0.03, 4e-4, -7e-4))
 _FISHEYE = Camera("fisheye", 4000, 3000, 1310.0, 1305.0, 2003.5, 1496.5, (-0.02, 4e-3, -1e-3, 1e-4), "fisheye")
 _K3 = Camera("k3", 4000, 3000, 2510.0, 2495.0, 2003.5, 1496.5, (-0.22, 0.06, 4e-4, -7e-4, 0.01))
+_RATIONAL = Camera(
+    "rational",
+    4000,
+    3000,
+    2510.0,
+    2495.0,
+    2003.5,
+    1496.5,
+    (0.31, -0.12, 4e-4, -7e-4, 0.02, 0.42, -0.08, 0.01),
+    "rational",
+)
 _CAMERAS = pytest.mark.parametrize("camera", [_PINHOLE, _BROWN, _FISHEYE], ids=["pinhole", "brown", "fisheye"])
-_WITH_K3 = pytest.mark.parametrize(
-    "camera", [_PINHOLE, _BROWN, _FISHEYE, _K3], ids=["pinhole", "brown", "fisheye", "k3"]
+_ALL_LENSES = pytest.mark.parametrize(
+    "camera", [_PINHOLE, _BROWN, _FISHEYE, _K3, _RATIONAL], ids=["pinhole", "brown", "fisheye", "k3", "rational"]
 )
 _WORLD_FROM_CAM = Rigid3.exp([0.4, -1.1, 0.7, 120.0, -50.0, 30.0])
 _XI = np.array([0.3, -0.8, 0.5, 2.0, -1.0, 0.7])
@@ -50,7 +61,7 @@ def gtsam_camera(camera: Camera, world_from_cam: Rigid3) -> Any:
 # --- one point, four libraries --------------------------------------------------------------------
 
 
-@_WITH_K3
+@_ALL_LENSES
 def test_the_same_pixel_as_colmap(camera: Camera) -> None:
     cam_from_world = _WORLD_FROM_CAM.inverse()
     pose = pycolmap.Rigid3d(pycolmap.Rotation3d(cam_from_world.rotation), cam_from_world.translation)
@@ -66,7 +77,7 @@ def test_the_same_pixel_as_colmap(camera: Camera) -> None:
     np.testing.assert_allclose(slopes, theirs, atol=4e-10)  # COLMAP stops at 1e-10 of a slope
 
 
-@_WITH_K3
+@_ALL_LENSES
 def test_the_same_pixel_as_opencv(camera: Camera) -> None:
     cam_from_world, points = _WORLD_FROM_CAM.inverse(), points_in_world()
     rvec, _ = cv2.Rodrigues(cam_from_world.rotation)

@@ -237,8 +237,14 @@ CASES: dict[str, tuple[Callable, str, list[str], int | None]] = {
     ),
     "an unknown that cannot be estimated": (
         read_cameras,
-        CAMERA_HEADER.strip() + ",estimate\ncam,3000,2000,2800,2800,1500,1000,focal k3\n",
-        ["Column 'estimate' has 'focal k3'", '"focal k1"', "leave it empty"],
+        CAMERA_HEADER.strip() + ",estimate\ncam,3000,2000,2800,2800,1500,1000,focal skew\n",
+        ["Column 'estimate' has 'focal skew'", '"focal k1"', "leave it empty"],
+        2,
+    ),
+    "an unknown that the model does not have": (
+        read_cameras,
+        CAMERA_HEADER.strip() + ",model,estimate\ncam,3000,2000,2800,2800,1500,1000,brown,focal k4\n",
+        ["Column 'estimate' has 'k4'", "'brown' does not have", "rational: k1 to k6", "name the right model"],
         2,
     ),
     "no focal length, and not declared unknown": (

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from georef.geometry.camera import (
     ESTIMABLE,
+    PLAIN,
     Camera,
     CameraModel,
     ideal_from_observed,
@@ -30,16 +31,27 @@ _LENSES = [
     (0.5, 0.2, -1e-3, 2e-3),
     (-0.28, 0.12, 4e-4, -2e-4, -0.02),
 ]
+_RATIONALS = [
+    (0.12, 0.02, 5e-4, -3e-4, 0.004, 0.05, 0.01, 0.002),
+    (8.2, 3.9, 2e-4, -1e-4, 0.18, 8.5, 5.9, 1.02),
+    (0.4, 0.1, 1e-3, 2e-3, 0.02, 0.9, 0.2, 0.0),
+]
 _FISHEYES = [(), (-0.01,), (0.03, -0.006, 0.001, -1e-4), (-0.02, 1e-3, -2e-4, 1e-5)]
 
 
 def camera(distortion: tuple[float, ...] = (), model: CameraModel = "pinhole") -> Camera:
+    if model == "rational":
+        return Camera("r", 6000, 4000, 2100.0, 2090.0, 3010.0, 1995.0, distortion, "rational")
     if model == "fisheye":
         return Camera("f", 3000, 3000, 860.0, 858.0, 1510.0, 1495.0, distortion, "fisheye")
     return Camera("c", 6000, 4000, 3500.0, 3490.0, 3010.0, 1995.0, distortion)
 
 
-_ALL = [camera(d) for d in _LENSES] + [camera(d, "fisheye") for d in _FISHEYES]
+_ALL = [
+    *(camera(d) for d in _LENSES),
+    *(camera(d, "fisheye") for d in _FISHEYES),
+    *(camera(d, "rational") for d in _RATIONALS),
+]
 _CAMERAS = pytest.mark.parametrize("lens", _ALL, ids=[f"{c.model}{c.distortion}" for c in _ALL])
 
 
@@ -93,7 +105,8 @@ def test_derivatives_of_rays_are_those_of_differences(lens: Camera) -> None:
 
 @_CAMERAS
 def test_derivatives_by_intrinsics_are_those_of_a_changed_camera(lens: Camera) -> None:
-    names = tuple(n for n in ESTIMABLE if lens.model != "pinhole" or n[0] != "k")
+    names = tuple(n for n in ESTIMABLE if n in PLAIN or n in lens.lens.parameters)
+    assert len(names) == 4 + {"pinhole": 0, "brown": 5, "fisheye": 4, "rational": 8}[lens.model]
     points = 3.0 * rays_from_pixels(lens, grid(lens))
     ours = intrinsic_derivatives(lens, points, names)
     assert ours.shape == (len(points), 2, len(names))
@@ -155,7 +168,15 @@ def test_the_model_follows_from_the_distortion_or_is_named() -> None:
     assert camera((0.1, 0.0, 0.0, 0.0)).model == "brown"
     assert camera((), "fisheye").model == "fisheye"
     assert replace(camera(), estimate=("focal", "k1")).model == "brown"
-    for bad in ({"distortion": (0.0,) * 6}, {"distortion": (0.0,) * 5, "model": "fisheye"}, {"estimate": ("skew",)}):
+    assert replace(camera(), estimate=("p1", "k3")).model == "brown"
+    for bad in (
+        {"distortion": (0.0,) * 6},
+        {"distortion": (0.0,) * 5, "model": "fisheye"},
+        {"distortion": (0.0,) * 9, "model": "rational"},
+        {"estimate": ("skew",)},
+        {"estimate": ("k4",)},
+        {"estimate": ("p1",), "model": "fisheye"},
+    ):
         with pytest.raises(ValueError, match="camera 'c'"):
             replace(camera(), **bad)
 
@@ -169,6 +190,40 @@ def test_a_changed_camera_has_its_focal_length_scaled_and_its_coefficients_shift
     moved = camera().changed(("cx", "cy", "aspect"), [0.01, -0.01, np.log(1.02)])
     assert (moved.cx, moved.cy, moved.fx, moved.fy) == pytest.approx((3045.0, 1960.0, 3500.0, 3559.8))
     assert moved.unit("cx") == moved.value("focal")
+
+
+def test_every_coefficient_can_be_changed_and_no_other_moves() -> None:
+    for lens in _ALL:
+        for index, name in enumerate(lens.lens.parameters):
+            changed = lens.changed((name,), [0.25])
+            difference = changed.coefficients - lens.coefficients
+            np.testing.assert_allclose(difference, 0.25 * np.eye(8)[index], atol=1e-15)
+            assert changed.value(name) == pytest.approx(lens.value(name) + 0.25)
+            assert (changed.model, changed.fx, changed.cy) == (lens.model, lens.fx, lens.cy)
+
+
+def test_a_rational_lens_with_a_plain_denominator_is_browns() -> None:
+    k = (-0.28, 0.12, 4e-4, -2e-4, -0.02)
+    brown, rational = camera(k), replace(camera(), distortion=k, model="rational")
+    points = 3.0 * rays_from_pixels(brown, grid())
+    np.testing.assert_allclose(project(rational, points), project(brown, points), atol=1e-10)
+    assert rational.limit == pytest.approx(brown.limit)
+
+
+def test_a_rational_lens_ends_where_it_folds_or_its_denominator_vanishes() -> None:
+    folding = camera((0.0, 0.0, 0.0, 0.0, 0.0, 0.5), "rational")  # r / (1 + r^2 / 2) rises up to sqrt(2)
+    assert folding.limit == pytest.approx(np.sqrt(2.0))
+    pole = camera((0.0, 0.0, 0.0, 0.0, 0.0, -0.25), "rational")  # r / (1 - r^2 / 4)
+    assert pole.limit == pytest.approx(2.0)
+    for lens in (folding, pole):
+        assert np.isnan(project(lens, [[lens.limit * 1.001, 0.0, 1.0]])).all()
+        assert np.isfinite(project(lens, [[lens.limit * 0.999, 0.0, 1.0]])).all()
+    farthest = folding.cx + folding.fx / np.sqrt(2.0)
+    rays = rays_from_pixels(folding, [[farthest - 1.0, folding.cy], [farthest + 1.0, folding.cy]])
+    np.testing.assert_array_equal(np.isnan(rays).any(axis=1), [False, True])
+    far = rays_from_pixels(pole, [[pole.cx + 1e5, pole.cy]])  # all pixels have a ray
+    np.testing.assert_allclose(project(pole, far), [[pole.cx + 1e5, pole.cy]], rtol=1e-9)
+    assert camera((0.1, 0.0, 0.0, 0.0, 0.0, 0.1), "rational").limit == np.inf
 
 
 def test_the_optical_axis_hits_the_principal_point_and_x_is_right() -> None:

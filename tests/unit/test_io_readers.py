@@ -141,6 +141,21 @@ def test_named_camera_models(tmp_path: Path) -> None:
     assert cameras["ideal"] == Camera("ideal", 80, 60, 30.0, 30.0, 41.0, 31.0, (0.0,) * 4, "fisheye")
 
 
+def test_a_rational_camera_and_unknown_coefficients(tmp_path: Path) -> None:
+    header = "camera,model,width,height,fx,fy,cx,cy,k1,k2,k3,k4,k5,k6,p1,p2,estimate\n"
+    rows = (
+        "r,rational,80,60,70,71,41,31,0.1,0.2,0.3,0.4,0.5,0.6,1e-3,2e-3,focal k6 p1\n"
+        "b,,80,60,70,71,41,31,,,,,,,,,k3 p2\nf,fisheye,80,60,70,71,41,31,,,,,,,,,k4\n"
+    )
+    cameras = read_cameras(written(tmp_path, header + rows))
+    assert cameras["r"].distortion == (0.1, 0.2, 1e-3, 2e-3, 0.3, 0.4, 0.5, 0.6)
+    assert [(c.model, c.estimate) for c in cameras.values()] == [
+        ("rational", ("focal", "k6", "p1")),
+        ("brown", ("k3", "p2")),
+        ("fisheye", ("k4",)),
+    ]
+
+
 def test_cameras_that_are_not_known(tmp_path: Path) -> None:
     rows = "a,80,60,,,,,focal\nb,80,60,90,91,41,31,focal+k1\nc,80,60,70,71,41,31,\n"
     cameras = read_cameras(written(tmp_path, "camera,width,height,fx,fy,cx,cy,estimate\n" + rows))

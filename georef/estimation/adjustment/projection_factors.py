@@ -1,9 +1,9 @@
 """Image observations as factors of GTSAM, each with the camera that it was taken by.
 
 Pinhole, brown and fisheye cameras are GTSAM's Cal3_S2, Cal3DS2 and Cal3Fisheye. What these do not have, rays of a
-fisheye that are far from its axis and brown with k3, is observed by a pinhole of its own that looks along the ray:
-the residual is then that of the slopes about the ray, weighted by the noise of the pixel carried over. The two agree
-to first order in the residual, a few pixels against a focal length.
+fisheye that are far from its axis, brown with k3 and rational, is observed by a pinhole of its own that looks along
+the ray: the residual is then that of the slopes about the ray, weighted by the noise of the pixel carried over. The
+two agree to first order in the residual, a few pixels against a focal length.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ def add_observations(
 
 
 def _has_native(camera: Camera, rays: Array) -> NDArray[np.bool_]:
-    if camera.coefficients[4] != 0.0:
+    if camera.model not in _PER_POINT or camera.coefficients[4] != 0.0:
         return np.zeros(len(rays), bool)
     with np.errstate(invalid="ignore"):
         return rays[:, 2] / np.linalg.norm(rays, axis=1) > _LEAST_DEPTH
