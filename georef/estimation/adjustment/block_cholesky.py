@@ -10,12 +10,14 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg.blas import dtrsm
-from scipy.linalg.lapack import dpotrf, dtrtri
+from scipy.linalg import get_blas_funcs, get_lapack_funcs
 
 from georef.estimation.adjustment.block import Indices
 from georef.estimation.adjustment.block_order import Front, fronts_of
 from georef.geometry.rigid import Array
+
+(dtrsm,) = get_blas_funcs(("trsm",), dtype=np.float64)
+dpotrf, dtrtri = get_lapack_funcs(("potrf", "trtri"), dtype=np.float64)
 
 VANISHING_PIVOT = 1e-12  # of its diagonal element before elimination: less is rounding
 
@@ -191,7 +193,7 @@ def _taken(pattern: Pattern, index: int, inverse: Array, out: Array) -> None:
 
 
 def _scaled(pattern: Pattern, blocks: Array) -> tuple[Array, Array]:
-    """The scale that makes the diagonal one, and the scaled blocks: radians and metres differ by orders of magnitude."""
+    """The scale that makes the diagonal one, and the scaled blocks: radians and metres differ by much."""
     diagonal = np.zeros((pattern.stations, 6))
     own = pattern.block_row == pattern.block_column
     diagonal[pattern.block_row[own]] = np.diagonal(blocks[own], axis1=1, axis2=2)

@@ -29,7 +29,7 @@ class Front:
 
 
 def fronts_of(stations: int, row: Indices, column: Indices) -> list[Front]:
-    """Fronts of a symmetric pattern, children before parents. row, column (N,): stations of each block, any triangle."""
+    """Fronts of a symmetric pattern, children before parents. row, column (N,): stations of each block."""
     orders = [_minimum_degree(stations, row, column)]
     if stations > 2:
         orders.append(_nested_dissection(stations, row, column))
@@ -105,7 +105,7 @@ def _fronts(row: Indices, column: Indices, order: Indices) -> list[Front]:
 
 
 def _structures(low: Indices, high: Indices, count: int) -> tuple[list[Indices], list[int]]:
-    """Rows below the diagonal of each column of the factor, sorted, and its parent in the elimination tree (-1: root)."""
+    """Rows below the diagonal of each column of the factor, sorted, and its parent (-1: none)."""
     apart = low != high
     low, high = low[apart], high[apart]
     sorting = np.argsort(low, kind="stable")
