@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from georef.crs import CrsDefinition, WorldFrame, choose_origin, crs_kind
 from georef.errors import InputError
-from georef.estimation.adjustment.block import Block, PointPriors
+from georef.estimation.adjustment.block import Block
 from georef.geometry.camera import Camera
 from georef.geometry.projection import Views
 from georef.geometry.rigid import Array
@@ -82,34 +82,6 @@ def load_block(project: Project, name: str) -> BlockSurvey:
         declared_control=_declared_control(project, name, surveyed),
         check_kind=CheckKind.ABSOLUTE if project.file.points is None else CheckKind(project.file.points.check_kind),
         dropped=dropped,
-    )
-
-
-def with_control(block: Block, control: Sequence[ControlPoint]) -> Block:
-    """The block with surveyed points, which start from their given coordinates, and their marks."""
-    index = {name: i for i, name in enumerate(block.image_ids)}
-    first = len(block.points)
-    marks = [(k, mark) for k, point in enumerate(control) for mark in point.marks if mark.image_id in index]
-    added = Observations(
-        point=np.array([first + k for k, _ in marks], dtype=np.int64),
-        view=np.array([index[mark.image_id] for _, mark in marks], dtype=np.int64),
-        pixel=np.array([mark.pixel for _, mark in marks]).reshape(-1, 2),
-        sigma_px=np.array([mark.sigma_px for _, mark in marks]),
-        keypoint=np.full(len(marks), -1),
-    )
-    positions = np.array([point.point_in_world for point in control]).reshape(-1, 3)
-    priors = PointPriors(
-        point=first + np.arange(len(control)),
-        position=positions,
-        information=np.array([np.linalg.inv(point.cov) for point in control], dtype=np.float64).reshape(-1, 3, 3),
-        kind=np.zeros(len(control), np.int64),
-        point_ids=tuple(point.point_id for point in control),
-    )
-    return replace(
-        block,
-        points=np.concatenate([block.points, positions]),
-        observations=Observations.joined([block.observations, added]),
-        point_priors=priors,
     )
 
 
