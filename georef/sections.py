@@ -88,6 +88,13 @@ class HoldOut(Section):
     count: int = Field(default=20, ge=1)
 
 
+class BlockComparison(Section):
+    """Another program's calibration of the only camera, which the report compares with."""
+
+    format: Literal["pix4d"]
+    camera: str
+
+
 class BlockSection(Section):
     """attitude: "vertical" where all cameras look straight down but for a few degrees, else a table to start from.
 
@@ -103,6 +110,7 @@ class BlockSection(Section):
     camera_sigma: dict[str, float] = Field(default_factory=dict)
     control: Literal["all", "none"] | tuple[str, ...] = "all"
     hold_out: HoldOut | None = None
+    compare: BlockComparison | None = None
 
     @field_validator("camera_sigma")
     @classmethod
