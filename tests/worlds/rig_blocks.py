@@ -27,6 +27,7 @@ from georef.estimation.adjustment.block import (
 from georef.estimation.adjustment.reduced import Layout
 from georef.geometry.camera import Camera
 from georef.geometry.poses import Poses
+from georef.geometry.projection import Views
 from georef.geometry.rigid import Array, Rigid3, exp_so3
 from georef.types.scene import Observations
 
@@ -60,8 +61,9 @@ def rig_block(seed: int = 0, cameras: tuple[Camera, Camera] = (LEFT, RIGHT), dis
         cameras=tuple(_true_camera(c, rng) for c in cameras),
         lever_arms_m=np.array([[0.1, -1.5, 0.2], [0.3, -1.2, -0.4] + 0.02 * rng.normal(size=3)]),
         drift_m=0.03 * rng.normal(size=(2, 3)),
-        points=_points(rng),
+        points=np.zeros((0, 3)),
     )
+    truth = replace(truth, points=_points(truth, rng))
     start = 0.02 * disturbed * np.array([1.0, 1.0, 1.0, 10.0, 10.0, 10.0])
     block = Block(
         station_ids=tuple(f"s{i}" for i in range(STATIONS)),
@@ -111,20 +113,39 @@ def _stations(rng: np.random.Generator) -> Poses:
     return Poses(_FORWARD_NORTH @ turned.rotation, centres)
 
 
-def _points(rng: np.random.Generator) -> Array:
-    side = np.where(np.arange(POINTS) % 2 == 0, -1.0, 1.0)
-    across = side * rng.uniform(5.0, 9.0, POINTS)
-    return np.stack([across, rng.uniform(1.0, 18.0, POINTS), rng.uniform(0.0, 8.0, POINTS)], axis=1)
+def _points(truth: State, rng: np.random.Generator) -> Array:
+    """Points of facades to the left and right by turns, each in sight of two stations at least."""
+    side = np.where(np.arange(10 * POINTS) % 2 == 0, -1.0, 1.0)
+    across, along, up = (
+        side * rng.uniform(5.0, 9.0, len(side)),
+        rng.uniform(1.0, 18.0, len(side)),
+        rng.uniform(0.0, 8.0, len(side)),
+    )
+    points = np.stack([across, along, up], axis=1)
+    view, point, _ = _seen(truth, points)
+    seen = np.zeros((len(points), STATIONS), bool)
+    seen[point, view // 2] = True
+    often = seen.sum(axis=1) >= 2
+    chosen = [np.flatnonzero(often & (side == s))[: POINTS // 2] for s in (-1.0, 1.0)]
+    return points[np.stack(chosen, axis=1).ravel()]
+
+
+def _seen(truth: State, points: Array) -> tuple[Indices, Indices, Array]:
+    """Views (n,), points (n,) and exact pixels (n, 2) of all that images show; two images a station."""
+    images = np.arange(2 * STATIONS)
+    poses = truth.world_from_rig.take(images // 2) @ truth.rig_from_cam.take(images % 2)
+    views = Views.of(poses.to_list(), [truth.cameras[i % 2] for i in images])
+    view, point = (a.ravel() for a in np.meshgrid(images, np.arange(len(points)), indexing="ij"))
+    pixel = views.project(view, points[point])
+    size = np.array([[c.width, c.height] for c in truth.cameras])[view % 2]
+    with np.errstate(invalid="ignore"):
+        shown = ((pixel > 0) & (pixel < size)).all(axis=1)
+    return view[shown], point[shown], pixel[shown]
 
 
 def _observed(block: Block, truth: State, rng: np.random.Generator) -> Block:
-    """Every point in every image that shows it."""
-    view, point = (a.ravel() for a in np.meshgrid(np.arange(len(block.image_ids)), np.arange(POINTS), indexing="ij"))
-    pixel = block.views(truth).project(view, truth.points[point])
-    size = np.array([[c.width, c.height] for c in truth.cameras])[block.calibration[view]]
-    with np.errstate(invalid="ignore"):
-        shown = ((pixel > 0) & (pixel < size)).all(axis=1)
-    view, point, pixel = view[shown], point[shown], pixel[shown] + SIGMA_PX * rng.normal(size=(int(shown.sum()), 2))
+    view, point, pixel = _seen(truth, truth.points)
+    pixel = pixel + SIGMA_PX * rng.normal(size=pixel.shape)
     observations = Observations(point, view, pixel, np.full(len(view), SIGMA_PX), np.arange(len(view)))
     return replace(block, observations=observations)
 

@@ -94,7 +94,7 @@ def _pose_priors(block: Block, state: State, layout: Layout) -> Term:
 def _position_priors(block: Block, state: State, layout: Layout) -> Term:
     priors = block.position_priors
     poses, lever_m = state.world_from_rig.take(priors.station), state.lever_arms_m[priors.antenna]
-    node, weight = _drift_at(block)
+    node, weight = drift_at(block)
     residual = poses.apply(lever_m) - priors.position
     by_drift = weight[:, :, None, None] * np.eye(3)
     if len(state.drift_m):
@@ -110,7 +110,7 @@ def _position_priors(block: Block, state: State, layout: Layout) -> Term:
     return _term(POSITION_PRIORS, whitening(priors.cov), residual, columns)
 
 
-def _drift_at(block: Block) -> tuple[Indices, Array]:
+def drift_at(block: Block) -> tuple[Indices, Array]:
     """Drift nodes (K, 2) of positions, -1: none, and their weights (K, 2); one node named twice is taken once."""
     node, weight = block.position_priors.drift_node.copy(), block.position_priors.drift_weight.copy()
     weight[node < 0] = 0.0

@@ -100,9 +100,7 @@ def total_cost(
     point the lens does not show; how many those are."""
     losses, prepared = losses or {}, prepared or Prepared.of(block)
     scale = losses.get(IMAGE_OBSERVATIONS, 0.0)
-    cost, hidden = all_cost(
-        *(prepared.tracks, prepared.images, placed(state), state.points, scale, hidden_square, prepared.work())
-    )
+    cost, hidden = all_cost(*(prepared.tracks, prepared.images, placed(state), state.points, scale, hidden_square))
     return float(cost) + constraint_cost(block, state, prepared.layout, losses), int(hidden)
 
 
@@ -114,7 +112,9 @@ def constraint_cost(block: Block, state: State, layout: Layout, losses: Losses) 
     return cost
 
 
-def promised_by_constraints(block: Block, state: State, step: Array, moved: Array, layout: Layout, losses: Losses) -> float:
+def promised_by_constraints(
+    block: Block, state: State, step: Array, moved: Array, layout: Layout, losses: Losses
+) -> float:
     """Decrease of the cost of constraints that their linear model promises for a step (6 S + B,), points moved to
     (P, 3)."""
     before, after = 0.0, 0.0

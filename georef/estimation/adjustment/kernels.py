@@ -19,7 +19,7 @@ from georef.geometry.rigid import Array
 # NaN and infinity keep their meaning: only sums may be reordered and multiplications joined with additions.
 kernel = numba.njit(cache=True, error_model="numpy", fastmath={"contract", "reassoc", "nsz"})
 
-PINHOLE, BROWN, FISHEYE = (list(MODELS).index(name) for name in ("pinhole", "brown", "fisheye"))
+PINHOLE, BROWN, FISHEYE, RATIONAL = (list(MODELS).index(name) for name in ("pinhole", "brown", "fisheye", "rational"))
 FOCAL, ASPECT, CENTRE_X, CENTRE_Y, FIRST_COEFFICIENT = range(5)
 _ON_AXIS = 1e-9
 
@@ -48,34 +48,42 @@ class Placed(NamedTuple):
 
 
 @kernel
-def lens(model, k, x, y, z, image, by_point):
-    """Image coordinates (2,) at unit focal length and their derivatives (2, 3); False where the lens shows nothing."""
-    limit = k[k.shape[0] - 1]
+def lens(model, parameters, row, x, y, z, out):
+    """Image coordinates at unit focal length in out[:2], their derivatives by the point, row by row, in out[2:8]; False
+    where the lens shows nothing. parameters (C, ...), of which the row is meant."""
+    limit = parameters[row, parameters.shape[1] - 1]
     if model == FISHEYE:
-        return _fisheye(k, limit, x, y, z, image, by_point)
+        return _fisheye(parameters, row, limit, x, y, z, out)
     if not z > 0.0:
         return False
-    a, b, inverse = x / z, y / z, 1.0 / z
-    image[0], image[1] = a, b
+    inverse = 1.0 / z
+    a, b = x * inverse, y * inverse
+    out[0], out[1] = a, b
     xx, xy, yy = 1.0, 0.0, 1.0
-    if model == BROWN:
+    if model != PINHOLE:
         if not a * a + b * b <= limit * limit:
             return False
-        xx, xy, yy = _brown(k, a, b, image)
-    by_point[0, 0], by_point[0, 1], by_point[0, 2] = xx * inverse, xy * inverse, -(xx * a + xy * b) * inverse
-    by_point[1, 0], by_point[1, 1], by_point[1, 2] = xy * inverse, yy * inverse, -(xy * a + yy * b) * inverse
+        xx, xy, yy = _bend(model, parameters, row, a, b, out)
+    out[2], out[3], out[4] = xx * inverse, xy * inverse, -(xx * a + xy * b) * inverse
+    out[5], out[6], out[7] = xy * inverse, yy * inverse, -(xy * a + yy * b) * inverse
     return True
 
 
 @kernel
-def _brown(k, x, y, image):
-    """Distorts slopes into image (2,); the symmetric derivative xx, xy, yy."""
-    k1, k2, p1, p2, k3 = k[4], k[5], k[6], k[7], k[8]
+def _bend(model, k, row, x, y, out):
+    """Distorts slopes by Brown's or the rational model into out[:2]; the symmetric derivative xx, xy, yy."""
+    k1, k2, p1, p2, k3 = k[row, 4], k[row, 5], k[row, 6], k[row, 7], k[row, 8]
     r2 = x * x + y * y
     radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
-    rate = 2.0 * (k1 + r2 * (2.0 * k2 + 3.0 * r2 * k3))
-    image[0] = x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x)
-    image[1] = y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y
+    rate = k1 + r2 * (2.0 * k2 + 3.0 * r2 * k3)
+    if model == RATIONAL:
+        k4, k5, k6 = k[row, 9], k[row, 10], k[row, 11]
+        below = 1.0 + r2 * (k4 + r2 * (k5 + r2 * k6))
+        radial /= below
+        rate = (rate - radial * (k4 + r2 * (2.0 * k5 + 3.0 * r2 * k6))) / below
+    rate *= 2.0
+    out[0] = x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x)
+    out[1] = y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y
     return (
         radial + rate * x * x + 2.0 * p1 * y + 6.0 * p2 * x,
         rate * x * y + 2.0 * p1 * x + 2.0 * p2 * y,
@@ -84,38 +92,36 @@ def _brown(k, x, y, image):
 
 
 @kernel
-def _fisheye(k, limit, x, y, z, image, by_point):
+def _fisheye(k, row, limit, x, y, z, out):
     across = sqrt(x * x + y * y)
     angle = atan2(across, z)
     if not (angle <= limit and (across > 0.0 or z > 0.0)):
         return False
+    k1, k2, k3, k4 = k[row, 4], k[row, 5], k[row, 6], k[row, 7]
     t2 = angle * angle
-    radius = angle * (1.0 + t2 * (k[4] + t2 * (k[5] + t2 * (k[6] + t2 * k[7]))))
-    rate = 1.0 + t2 * (3.0 * k[4] + t2 * (5.0 * k[5] + t2 * (7.0 * k[6] + t2 * 9.0 * k[7])))
+    radius = angle * (1.0 + t2 * (k1 + t2 * (k2 + t2 * (k3 + t2 * k4))))
+    rate = 1.0 + t2 * (3.0 * k1 + t2 * (5.0 * k2 + t2 * (7.0 * k3 + t2 * 9.0 * k4)))
     squared = across * across + z * z
     if across <= _ON_AXIS * abs(z):
         ex, ey, sideways = 1.0, 0.0, 1.0 / z
-        image[0], image[1] = x / z, y / z
+        out[0], out[1] = x / z, y / z
     else:
         ex, ey, sideways = x / across, y / across, radius / across
-        image[0], image[1] = radius * ex, radius * ey
-    turn = rate * z / squared - sideways
-    by_point[0, 0], by_point[0, 1] = sideways + turn * ex * ex, turn * ex * ey
-    by_point[1, 0], by_point[1, 1] = turn * ex * ey, sideways + turn * ey * ey
-    back = -rate * across / squared
-    by_point[0, 2], by_point[1, 2] = back * ex, back * ey
+        out[0], out[1] = radius * ex, radius * ey
+    turn, back = rate * z / squared - sideways, -rate * across / squared
+    out[2], out[3], out[4] = sideways + turn * ex * ex, turn * ex * ey, back * ex
+    out[5], out[6], out[7] = turn * ex * ey, sideways + turn * ey * ey, back * ey
     return True
 
 
 @kernel
-def by_coefficient(model, index, x, y, z):
+def _by_coefficient(index, model, k, row, x, y, z):
     """Derivative of the image coordinates by one coefficient of a lens that shows the point."""
     if model == FISHEYE:
         across = sqrt(x * x + y * y)
-        angle = atan2(across, z)
         if across <= _ON_AXIS * abs(z):
             return 0.0, 0.0
-        power = angle ** (2 * index + 3)
+        power = atan2(across, z) ** (2 * index + 3)
         return power * x / across, power * y / across
     a, b = x / z, y / z
     r2 = a * a + b * b
@@ -123,62 +129,28 @@ def by_coefficient(model, index, x, y, z):
         return 2.0 * a * b, r2 + 2.0 * b * b
     if index == 3:
         return r2 + 2.0 * a * a, 2.0 * a * b
-    power = r2 if index == 0 else (r2 * r2 if index == 1 else r2 * r2 * r2)
+    below = 1.0
+    if model == RATIONAL:
+        below = 1.0 + r2 * (k[row, 9] + r2 * (k[row, 10] + r2 * k[row, 11]))
+    if index <= 4:  # k1, k2, k3
+        power = r2 ** (index + 1 if index < 2 else 3) / below
+    else:  # k4, k5, k6
+        above = 1.0 + r2 * (k[row, 4] + r2 * (k[row, 5] + r2 * k[row, 8]))
+        power = -(r2 ** (index - 4)) * above / (below * below)
     return a * power, b * power
 
 
 @kernel
-def observe(placed, mounting, calibration, q, pixel, weight, cam, image, residual, by_cam):
-    """Residual (2,), projected minus observed, of a point q (3,) in the rig frame, and its derivatives (2, 3) by the
-    point in the camera frame, both times weight. Fills cam (3,) and image (2,) too. False where nothing is shown."""
-    rotation, k = placed.cam_rotation[mounting], placed.parameters[calibration]
-    for i in range(3):
-        cam[i] = (
-            rotation[i, 0] * q[0] + rotation[i, 1] * q[1] + rotation[i, 2] * q[2] + placed.cam_translation[mounting, i]
-        )
-    if not lens(placed.model[calibration], k, cam[0], cam[1], cam[2], image, by_cam):
-        return False
-    for i in range(2):
-        residual[i] = (image[i] * k[i] + k[2 + i] - pixel[i]) * weight
-        for j in range(3):
-            by_cam[i, j] *= k[i] * weight
-    return True
-
-
-@kernel
-def by_shared(images, placed, mounting, calibration, cam, image, weight, by_cam, out, column):
-    """Derivatives (2, n) of an observation by its mounting and calibration, where unknown, and their columns (n,) in
-    the border; n. From cam (3,), image (2,) and by_cam (2, 3) of `observe`, with the same weight."""
-    count = 0
-    first = images.mounting_column[mounting]
-    if first >= 0:
-        for i in range(2):
-            a, b, c = by_cam[i, 0], by_cam[i, 1], by_cam[i, 2]
-            out[i, 0], out[i, 1], out[i, 2] = b * cam[2] - c * cam[1], c * cam[0] - a * cam[2], a * cam[1] - b * cam[0]
-            out[i, 3], out[i, 4], out[i, 5] = -a, -b, -c
-        for j in range(6):
-            column[j] = first + j
-        count = 6
-    first = images.calibration_column[calibration]
-    if first >= 0:
-        for j in range(images.unknowns[calibration]):
-            _by_code(images.code[calibration, j], placed, calibration, cam, image, weight, out, count)
-            column[count] = first + j
-            count += 1
-    return count
-
-
-@kernel
-def _by_code(code, placed, calibration, cam, image, weight, out, at):
-    k = placed.parameters[calibration]
-    u, v = image[0] * k[0], image[1] * k[1]
+def by_unknown(code, model, parameters, row, cam_x, cam_y, cam_z, image_x, image_y):
+    """Derivative of a pixel by an unknown of its calibration; see `Images.code`."""
+    fx, fy = parameters[row, 0], parameters[row, 1]
+    if code == FOCAL:
+        return image_x * fx, image_y * fy
     if code == ASPECT:
-        u = 0.0
-    elif code == CENTRE_X:
-        u, v = k[0], 0.0
-    elif code == CENTRE_Y:
-        u, v = 0.0, k[0]
-    elif code >= FIRST_COEFFICIENT:
-        a, b = by_coefficient(placed.model[calibration], code - FIRST_COEFFICIENT, cam[0], cam[1], cam[2])
-        u, v = a * k[0], b * k[1]
-    out[0, at], out[1, at] = u * weight, v * weight
+        return 0.0, image_y * fy
+    if code == CENTRE_X:
+        return fx, 0.0
+    if code == CENTRE_Y:
+        return 0.0, fx
+    a, b = _by_coefficient(code - FIRST_COEFFICIENT, model, parameters, row, cam_x, cam_y, cam_z)
+    return a * fx, b * fy

@@ -8,13 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from georef.estimation.adjustment.kernels import kernel
-from georef.estimation.adjustment.kernels_points import (
-    add_prior,
-    invert_root,
-    linearize_track,
-    point_normal,
-    sum_stations,
-)
+from georef.estimation.adjustment.kernels_points import BATCH, keep, linearize, point_normals, share, sum_stations
 from georef.geometry.rigid import Array
 
 
@@ -38,186 +32,183 @@ def eliminate_points(tracks, images, placed, points, information, shift, damping
     relative to the diagonal of points.
     """
     cost, hidden, undetermined = 0.0, 0, 0
-    unknown = 6 * placed.rig_rotation.shape[0]
-    shared = sums.corner.shape[0] > 0
-    for track in range(tracks.point.shape[0]):
-        xyz = points[tracks.point[track]]
-        slots, more, unseen = linearize_track(tracks, track, images, placed, xyz, cauchy, shared, work)
+    rays, slots, shared = work.rays, work.slots, work.shared
+    border = sums.corner.shape[0] > 0
+    for begin in range(0, tracks.point.shape[0], BATCH):
+        end = min(begin + BATCH, tracks.point.shape[0])
+        more, unseen = linearize(tracks, begin, end, images, placed, points, cauchy, rays, slots)
         cost, hidden = cost + more, hidden + unseen
-        count = tracks.start[track + 1] - tracks.start[track]
-        sum_stations(count, slots, work)
-        if tracks.kept[track] >= 0:
-            keep_point(count, tracks.kept[track], placed, work)
-            _add_stations(slots, sums, work)
-            _add_shared(count, unknown, sums, work)
-            continue
-        point_normal(slots, placed, work)
-        if tracks.prior[track] >= 0:
-            add_prior(information[tracks.prior[track]], shift[tracks.prior[track]], xyz, work)
-        undetermined += invert_root(work.normal, damping, work.root)
-        _add_stations(slots, sums, work)
-        _subtract_stations(slots, sums, work)
-        if shared:
-            _add_shared(count, unknown, sums, work)
-            _subtract_shared(_mix_shared(count, placed, work), slots, unknown, sums, work)
+        count = tracks.start[end] - tracks.start[begin]
+        sum_stations(count, slots.first[end - begin], rays, slots)
+        undetermined += point_normals(tracks, begin, end, placed, points, information, shift, damping, slots)
+        _add_stations(slots.first[end - begin], slots, sums)
+        _roots_of_stations(tracks, begin, end, slots, sums)
+        _subtract_stations(tracks, begin, end, slots, sums)
+        if border:
+            share(tracks, begin, end, images, placed, rays)
+            keep(tracks, begin, end, placed, rays, slots)
+            _add_shared(count, rays, slots, sums)
+            _subtract_shared(tracks, begin, end, placed, rays, slots, shared, sums)
     return cost, hidden, undetermined
 
 
 @kernel
-def _add_stations(slots, sums, work):
-    """The stations' own normal matrices T'MT and gradients T'g, T = [[q]x, -I]."""
-    f = work.normal6
-    for s in range(slots):
-        station, m, g = work.station[s], work.square[s], work.slope[s]
-        x, y, z = work.q[s, 0], work.q[s, 1], work.q[s, 2]
-        for j in range(3):  # T'M, (6, 3)
-            f[0, j], f[1, j], f[2, j] = z * m[1, j] - y * m[2, j], x * m[2, j] - z * m[0, j], y * m[0, j] - x * m[1, j]
-            f[3, j], f[4, j], f[5, j] = -m[0, j], -m[1, j], -m[2, j]
-        block = sums.block[sums.first[station]]
+def _add_stations(count, slots, sums):
+    """The stations' own normal matrices T'MT and gradients T'g, T = [[q]x, -I], of all slots."""
+    f = np.empty((6, 3))
+    block, gradient, diagonal = sums.block, sums.gradient, sums.diagonal
+    for s in range(count):
+        station = slots.station[s]
+        own, at = sums.first[station], 6 * station
+        x, y, z = slots.q[s, 0], slots.q[s, 1], slots.q[s, 2]
+        for j in range(3):  # T'M
+            m0, m1, m2 = slots.square[s, 0, j], slots.square[s, 1, j], slots.square[s, 2, j]
+            f[0, j], f[1, j], f[2, j] = z * m1 - y * m2, x * m2 - z * m0, y * m0 - x * m1
+            f[3, j], f[4, j], f[5, j] = -m0, -m1, -m2
         for i in range(6):
             a, b, c = f[i, 0], f[i, 1], f[i, 2]
-            block[i, 0] += b * z - c * y
-            block[i, 1] += c * x - a * z
-            block[i, 2] += a * y - b * x
-            block[i, 3] -= a
-            block[i, 4] -= b
-            block[i, 5] -= c
-        at = 6 * station
-        sums.diagonal[at] += f[0, 1] * z - f[0, 2] * y
-        sums.diagonal[at + 1] += f[1, 2] * x - f[1, 0] * z
-        sums.diagonal[at + 2] += f[2, 0] * y - f[2, 1] * x
+            block[own, i, 0] += b * z - c * y
+            block[own, i, 1] += c * x - a * z
+            block[own, i, 2] += a * y - b * x
+            block[own, i, 3] -= a
+            block[own, i, 4] -= b
+            block[own, i, 5] -= c
+        g0, g1, g2 = slots.slope[s, 0], slots.slope[s, 1], slots.slope[s, 2]
+        gradient[at] += z * g1 - y * g2
+        gradient[at + 1] += x * g2 - z * g0
+        gradient[at + 2] += y * g0 - x * g1
+        gradient[at + 3] -= g0
+        gradient[at + 4] -= g1
+        gradient[at + 5] -= g2
+        diagonal[at] += f[0, 1] * z - f[0, 2] * y
+        diagonal[at + 1] += f[1, 2] * x - f[1, 0] * z
+        diagonal[at + 2] += f[2, 0] * y - f[2, 1] * x
         for i in range(3):
-            sums.diagonal[at + 3 + i] += m[i, i]
-            sums.gradient[at + 3 + i] -= g[i]
-        sums.gradient[at] += z * g[1] - y * g[2]
-        sums.gradient[at + 1] += x * g[2] - z * g[0]
-        sums.gradient[at + 2] += y * g[0] - x * g[1]
+            diagonal[at + 3 + i] -= f[3 + i, i]
 
 
 @kernel
-def _subtract_stations(slots, sums, work):
-    """W N^-1 W' of all pairs of a point's stations, W N^-1 times its gradient; leaves E with W N^-1 W' = E E'."""
-    root, right = work.root, work.right
-    h0 = root[0, 0] * right[0]
-    h1 = root[1, 0] * right[0] + root[1, 1] * right[1]
-    h2 = root[2, 0] * right[0] + root[2, 1] * right[1] + root[2, 2] * right[2]
-    for s in range(slots):
-        x, e = work.mixed[s], work.eliminated[s]
-        qx, qy, qz = work.q[s, 0], work.q[s, 1], work.q[s, 2]
-        for i in range(3):
-            a, b, c = x[i, 0], x[i, 1], x[i, 2]
-            e[3 + i, 0] = -a * root[0, 0]
-            e[3 + i, 1] = -(a * root[1, 0] + b * root[1, 1])
-            e[3 + i, 2] = -(a * root[2, 0] + b * root[2, 1] + c * root[2, 2])
-        for j in range(3):
-            a, b, c = e[3, j], e[4, j], e[5, j]
-            e[0, j], e[1, j], e[2, j] = qy * c - qz * b, qz * a - qx * c, qx * b - qy * a
-        at = 6 * work.station[s]
-        for i in range(6):
-            sums.gradient[at + i] -= e[i, 0] * h0 + e[i, 1] * h1 + e[i, 2] * h2
-    right[0], right[1], right[2] = h0, h1, h2
-    for s in range(slots):
-        entry = sums.first[work.station[s]]
-        for other in range(s, slots):
-            while sums.column[entry] != work.station[other]:
-                entry += 1
-            subtract_product(work.eliminated[s], work.eliminated[other], sums.block[entry])
+def _roots_of_stations(tracks, begin, end, slots, sums):
+    """E of all slots, with W N^-1 W' = E'E; what elimination takes off the gradients. Leaves L^-1 times the points'
+    gradients in `right`."""
+    e, gradient = slots.eliminated, sums.gradient
+    for p in range(end - begin):
+        if tracks.kept[begin + p] >= 0:
+            continue
+        r00, r10, r11 = slots.root[p, 0, 0], slots.root[p, 1, 0], slots.root[p, 1, 1]
+        r20, r21, r22 = slots.root[p, 2, 0], slots.root[p, 2, 1], slots.root[p, 2, 2]
+        g0, g1, g2 = slots.right[p, 0], slots.right[p, 1], slots.right[p, 2]
+        h0, h1, h2 = r00 * g0, r10 * g0 + r11 * g1, r20 * g0 + r21 * g1 + r22 * g2
+        slots.right[p, 0], slots.right[p, 1], slots.right[p, 2] = h0, h1, h2
+        for s in range(slots.first[p], slots.first[p + 1]):
+            x, y, z = slots.q[s, 0], slots.q[s, 1], slots.q[s, 2]
+            for i in range(3):
+                a, b, c = slots.mixed[s, i, 0], slots.mixed[s, i, 1], slots.mixed[s, i, 2]
+                e[s, 0, 3 + i] = -r00 * a
+                e[s, 1, 3 + i] = -(r10 * a + r11 * b)
+                e[s, 2, 3 + i] = -(r20 * a + r21 * b + r22 * c)
+            for j in range(3):
+                a, b, c = e[s, j, 3], e[s, j, 4], e[s, j, 5]
+                e[s, j, 0], e[s, j, 1], e[s, j, 2] = y * c - z * b, z * a - x * c, x * b - y * a
+            at = 6 * slots.station[s]
+            for i in range(6):
+                gradient[at + i] -= e[s, 0, i] * h0 + e[s, 1, i] * h1 + e[s, 2, i] * h2
 
 
 @kernel
-def subtract_product(a, b, out):
-    """out (6, 6) -= a (6, 3) b'."""
-    for i in range(6):
-        x, y, z = a[i, 0], a[i, 1], a[i, 2]
-        for j in range(6):
-            out[i, j] -= x * b[j, 0] + y * b[j, 1] + z * b[j, 2]
+def _subtract_stations(tracks, begin, end, slots, sums):
+    """W N^-1 W' of all pairs of a point's stations."""
+    e, block, first, column = slots.eliminated, sums.block, sums.first, sums.column
+    for p in range(end - begin):
+        if tracks.kept[begin + p] >= 0:
+            continue
+        for s in range(slots.first[p], slots.first[p + 1]):
+            entry = first[slots.station[s]]
+            for other in range(s, slots.first[p + 1]):
+                there = slots.station[other]
+                while column[entry] != there:
+                    entry += 1
+                for i in range(6):
+                    a, b, c = e[s, 0, i], e[s, 1, i], e[s, 2, i]
+                    for j in range(6):
+                        block[entry, i, j] -= a * e[other, 0, j] + b * e[other, 1, j] + c * e[other, 2, j]
 
 
 @kernel
-def _add_shared(count, unknown, sums, work):
+def _add_shared(count, rays, slots, sums):
     """The border's own normal matrix, its products with stations, and its gradient."""
-    k = work.small
+    border, corner, gradient, diagonal = sums.border, sums.corner, sums.gradient, sums.diagonal
+    unknown = 6 * border.shape[0]
     for o in range(count):
-        s = work.slot[o]
+        s = rays.slot[o]
         if s < 0:
             continue
-        g, r, shared = work.by_rig[o], work.residual[o], work.shared[o]
-        x, y, z = work.q[s, 0], work.q[s, 1], work.q[s, 2]
-        rows = sums.border[work.station[s]]
-        for a in range(work.columns[o]):
-            at, u, v = work.column[o, a], shared[0, a], shared[1, a]
-            sums.gradient[unknown + at] += u * r[0] + v * r[1]
-            sums.diagonal[unknown + at] += u * u + v * v
-            for i in range(3):
-                k[0, i] = g[0, i] * u + g[1, i] * v
-            rows[0, at] += z * k[0, 1] - y * k[0, 2]
-            rows[1, at] += x * k[0, 2] - z * k[0, 0]
-            rows[2, at] += y * k[0, 0] - x * k[0, 1]
-            for i in range(3):
-                rows[3 + i, at] -= k[0, i]
+        station = slots.station[s]
+        x, y, z = slots.q[s, 0], slots.q[s, 1], slots.q[s, 2]
+        for a in range(rays.columns[o]):
+            at, u, v = rays.column[o, a], rays.shared[o, 0, a], rays.shared[o, 1, a]
+            gradient[unknown + at] += u * rays.residual[o, 0] + v * rays.residual[o, 1]
+            diagonal[unknown + at] += u * u + v * v
+            k0 = rays.by_rig[o, 0, 0] * u + rays.by_rig[o, 1, 0] * v
+            k1 = rays.by_rig[o, 0, 1] * u + rays.by_rig[o, 1, 1] * v
+            k2 = rays.by_rig[o, 0, 2] * u + rays.by_rig[o, 1, 2] * v
+            border[station, 0, at] += z * k1 - y * k2
+            border[station, 1, at] += x * k2 - z * k0
+            border[station, 2, at] += y * k0 - x * k1
+            border[station, 3, at] -= k0
+            border[station, 4, at] -= k1
+            border[station, 5, at] -= k2
             for b in range(a + 1):
-                sums.corner[at, work.column[o, b]] += u * shared[0, b] + v * shared[1, b]
+                corner[at, rays.column[o, b]] += u * rays.shared[o, 0, b] + v * rays.shared[o, 1, b]
 
 
 @kernel
-def _mix_shared(count, placed, work):
-    """W of the border's unknowns of a point, gathered from its observations; how many they are."""
+def _subtract_shared(tracks, begin, end, placed, rays, slots, shared, sums):
+    """W N^-1 W' of the border's unknowns of each point, with each other and with its stations."""
+    border, corner, gradient = sums.border, sums.corner, sums.gradient
+    unknown, mixed = 6 * border.shape[0], shared.mixed
+    for p in range(end - begin):
+        if tracks.kept[begin + p] >= 0:
+            continue
+        offset = tracks.start[begin]
+        first, last = tracks.start[begin + p] - offset, tracks.start[begin + p + 1] - offset
+        used = _mix_shared(first, last, placed.rig_rotation, rays, slots, shared)
+        root, h0, h1, h2 = slots.root, slots.right[p, 0], slots.right[p, 1], slots.right[p, 2]
+        for a in range(used):
+            at, w0, w1, w2 = shared.used[a], mixed[a, 0], mixed[a, 1], mixed[a, 2]
+            shared.place[at] = -1
+            w2 = w0 * root[p, 2, 0] + w1 * root[p, 2, 1] + w2 * root[p, 2, 2]
+            w1 = w0 * root[p, 1, 0] + w1 * root[p, 1, 1]
+            w0 = w0 * root[p, 0, 0]
+            mixed[a, 0], mixed[a, 1], mixed[a, 2] = w0, w1, w2
+            gradient[unknown + at] -= w0 * h0 + w1 * h1 + w2 * h2
+            for b in range(a + 1):
+                corner[at, shared.used[b]] -= w0 * mixed[b, 0] + w1 * mixed[b, 1] + w2 * mixed[b, 2]
+        for s in range(slots.first[p], slots.first[p + 1]):
+            station = slots.station[s]
+            for i in range(6):
+                e0, e1, e2 = slots.eliminated[s, 0, i], slots.eliminated[s, 1, i], slots.eliminated[s, 2, i]
+                for a in range(used):
+                    border[station, i, shared.used[a]] -= e0 * mixed[a, 0] + e1 * mixed[a, 1] + e2 * mixed[a, 2]
+
+
+@kernel
+def _mix_shared(first, last, rotation, rays, slots, shared):
+    """W of the border's unknowns of a point, gathered from its observations first to last; how many they are."""
     used = 0
-    for o in range(count):
-        s = work.slot[o]
-        if s < 0:
+    for o in range(first, last):
+        if rays.slot[o] < 0 or not rays.columns[o]:
             continue
-        g, shared, r = work.by_rig[o], work.shared[o], placed.rig_rotation[work.station[s]]
-        for i in range(2):
-            for j in range(3):
-                work.small[i, j] = g[i, 0] * r[0, j] + g[i, 1] * r[1, j] + g[i, 2] * r[2, j]
-        for a in range(work.columns[o]):
-            at = work.column[o, a]
-            if work.place[at] < 0:
-                work.place[at] = used
-                work.used[used] = at
-                work.border[used, :] = 0.0
-                used += 1
-            w = work.border[work.place[at]]
-            for j in range(3):
-                w[j] += shared[0, a] * work.small[0, j] + shared[1, a] * work.small[1, j]
-    return used
-
-
-@kernel
-def _subtract_shared(used, slots, unknown, sums, work):
-    """W N^-1 W' of the border's unknowns of a point, with each other and with its stations."""
-    root, h = work.root, work.right  # `right` is L^-1 times the gradient by now
-    for a in range(used):
-        w, at = work.border[a], work.used[a]
-        work.place[at] = -1
-        w2 = w[0] * root[2, 0] + w[1] * root[2, 1] + w[2] * root[2, 2]
-        w1 = w[0] * root[1, 0] + w[1] * root[1, 1]
-        w0 = w[0] * root[0, 0]
-        w[0], w[1], w[2] = w0, w1, w2
-        sums.gradient[unknown + at] -= w0 * h[0] + w1 * h[1] + w2 * h[2]
-        for b in range(a + 1):
-            other = work.border[b]
-            sums.corner[at, work.used[b]] -= w0 * other[0] + w1 * other[1] + w2 * other[2]
-    for s in range(slots):
-        e, rows = work.eliminated[s], sums.border[work.station[s]]
-        for i in range(6):
-            for a in range(used):
-                w = work.border[a]
-                rows[i, work.used[a]] -= e[i, 0] * w[0] + e[i, 1] * w[1] + e[i, 2] * w[2]
-
-
-@kernel
-def keep_point(count, column, placed, work):
-    """Turns the derivatives by a point that is not eliminated into ones by the border's unknowns column to column + 2."""
-    for o in range(count):
-        s = work.slot[o]
-        if s < 0:
-            continue
-        g, r, at = work.by_rig[o], placed.rig_rotation[work.station[s]], work.columns[o]
-        for i in range(2):
-            for j in range(3):
-                work.shared[o, i, at + j] = g[i, 0] * r[0, j] + g[i, 1] * r[1, j] + g[i, 2] * r[2, j]
+        station, g = slots.station[rays.slot[o]], rays.by_rig
         for j in range(3):
-            work.column[o, at + j] = column + j
-        work.columns[o] = at + 3
+            r0, r1, r2 = rotation[station, 0, j], rotation[station, 1, j], rotation[station, 2, j]
+            u = g[o, 0, 0] * r0 + g[o, 0, 1] * r1 + g[o, 0, 2] * r2
+            v = g[o, 1, 0] * r0 + g[o, 1, 1] * r1 + g[o, 1, 2] * r2
+            for a in range(rays.columns[o]):
+                at = rays.column[o, a]
+                if shared.place[at] < 0:
+                    shared.place[at], shared.used[used] = used, at
+                    shared.mixed[used, 0], shared.mixed[used, 1], shared.mixed[used, 2] = 0.0, 0.0, 0.0
+                    used += 1
+                shared.mixed[shared.place[at], j] += rays.shared[o, 0, a] * u + rays.shared[o, 1, a] * v
+    return used

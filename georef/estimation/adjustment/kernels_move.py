@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from georef.estimation.adjustment.kernels import kernel, observe
-from georef.estimation.adjustment.kernels_eliminate import keep_point
+import numpy as np
+
+from georef.estimation.adjustment.kernels import kernel, lens
 from georef.estimation.adjustment.kernels_points import (
-    add_prior,
-    invert_root,
-    linearize_track,
-    point_normal,
-    robust,
+    BATCH,
+    keep,
+    linearize,
+    loss,
+    point_normals,
+    share,
     sum_stations,
-    to_rig,
 )
 
 
@@ -25,116 +26,136 @@ def move_points(
     hidden_square for the squared residual of one that no lens shows, and how many those are.
     """
     promised, cost, hidden = 0.0, 0.0, 0
-    unknown = 6 * placed.rig_rotation.shape[0]
-    shared = step.shape[0] > unknown
-    for track in range(tracks.point.shape[0]):
-        point = tracks.point[track]
-        xyz, new = points[point], moved_points[point]
-        slots, _, _ = linearize_track(tracks, track, images, placed, xyz, cauchy, shared, work)
-        count = tracks.start[track + 1] - tracks.start[track]
-        kept = tracks.kept[track]
-        if kept >= 0:
-            keep_point(count, kept, placed, work)
-        promised += _predict(count, unknown, shared, step, work)
-        if kept >= 0:
-            for i in range(3):
-                new[i] = xyz[i] + step[unknown + kept + i]
-        else:
-            sum_stations(count, slots, work)
-            point_normal(slots, placed, work)
-            if tracks.prior[track] >= 0:
-                add_prior(information[tracks.prior[track]], shift[tracks.prior[track]], xyz, work)
-            invert_root(work.normal, damping, work.root)
-            _solve_point(work)
-            for i in range(3):
-                new[i] = xyz[i] + work.right[i]
-            _predict_by_point(count, placed, work)
-        for o in range(count):
-            if work.slot[o] >= 0:
-                promised -= 0.5 * (work.residual[o, 0] ** 2 + work.residual[o, 1] ** 2)
-        more, unseen = track_cost(tracks, track, images, moved, new, cauchy, hidden_square, work)
+    rays, slots = work.rays, work.slots
+    border = step.shape[0] > 6 * placed.rig_rotation.shape[0]
+    for begin in range(0, tracks.point.shape[0], BATCH):
+        end = min(begin + BATCH, tracks.point.shape[0])
+        linearize(tracks, begin, end, images, placed, points, cauchy, rays, slots)
+        if border:
+            share(tracks, begin, end, images, placed, rays)
+            keep(tracks, begin, end, placed, rays, slots)
+        count = tracks.start[end] - tracks.start[begin]
+        promised += _squares(count, rays)
+        _predict(count, 6 * placed.rig_rotation.shape[0], step, rays, slots)
+        sum_stations(count, slots.first[end - begin], rays, slots)
+        point_normals(tracks, begin, end, placed, points, information, shift, damping, slots)
+        _move(tracks, begin, end, 6 * placed.rig_rotation.shape[0], step, points, moved_points, slots)
+        _predict_by_points(tracks, begin, end, placed.rig_rotation, rays, slots)
+        promised -= _squares(count, rays)
+        more, unseen = _cost(tracks, begin, end, images, moved, moved_points, cauchy, hidden_square)
         cost, hidden = cost + more, hidden + unseen
     return promised, cost, hidden
 
 
 @kernel
-def _predict(count, unknown, shared, step, work):
-    """Adds to the residuals what the step of stations and border changes; their cost before."""
-    before = 0.0
+def _squares(count, rays):
+    """Half the squared residuals of a batch."""
+    total = 0.0
     for o in range(count):
-        s = work.slot[o]
+        if rays.slot[o] >= 0:
+            total += rays.residual[o, 0] ** 2 + rays.residual[o, 1] ** 2
+    return 0.5 * total
+
+
+@kernel
+def _predict(count, unknown, step, rays, slots):
+    """Adds to the residuals what the step of stations and border changes."""
+    for o in range(count):
+        s = rays.slot[o]
         if s < 0:
             continue
-        r, g, at, q = work.residual[o], work.by_rig[o], 6 * work.station[s], work.q[s]
-        before += 0.5 * (r[0] * r[0] + r[1] * r[1])
-        x = q[1] * step[at + 2] - q[2] * step[at + 1] - step[at + 3]
-        y = q[2] * step[at] - q[0] * step[at + 2] - step[at + 4]
-        z = q[0] * step[at + 1] - q[1] * step[at] - step[at + 5]
+        at, q = 6 * slots.station[s], slots.q
+        x = q[s, 1] * step[at + 2] - q[s, 2] * step[at + 1] - step[at + 3]
+        y = q[s, 2] * step[at] - q[s, 0] * step[at + 2] - step[at + 4]
+        z = q[s, 0] * step[at + 1] - q[s, 1] * step[at] - step[at + 5]
         for i in range(2):
-            r[i] += g[i, 0] * x + g[i, 1] * y + g[i, 2] * z
-        if shared:
-            for a in range(work.columns[o]):
-                change = step[unknown + work.column[o, a]]
-                r[0] += work.shared[o, 0, a] * change
-                r[1] += work.shared[o, 1, a] * change
-    return before
+            change = rays.by_rig[o, i, 0] * x + rays.by_rig[o, i, 1] * y + rays.by_rig[o, i, 2] * z
+            for a in range(rays.columns[o]):
+                change += rays.shared[o, i, a] * step[unknown + rays.column[o, a]]
+            rays.residual[o, i] += change
 
 
 @kernel
-def _solve_point(work):
-    """The point's step in `right`, from its gradient there."""
-    root, g = work.root, work.right
-    h0 = root[0, 0] * g[0]
-    h1 = root[1, 0] * g[0] + root[1, 1] * g[1]
-    h2 = root[2, 0] * g[0] + root[2, 1] * g[1] + root[2, 2] * g[2]
-    g[0] = -(root[0, 0] * h0 + root[1, 0] * h1 + root[2, 0] * h2)
-    g[1] = -(root[1, 1] * h1 + root[2, 1] * h2)
-    g[2] = -root[2, 2] * h2
-
-
-@kernel
-def _predict_by_point(count, placed, work):
-    """Adds to the residuals what the point's step changes."""
-    step = work.right
-    for o in range(count):
-        s = work.slot[o]
-        if s < 0:
+def _move(tracks, begin, end, unknown, step, points, moved_points, slots):
+    """Points of a batch after the step, from what is left of their gradients; leaves the steps of those that were
+    eliminated in `right`, zero for the others."""
+    for p in range(end - begin):
+        point, kept, right, root = tracks.point[begin + p], tracks.kept[begin + p], slots.right, slots.root
+        if kept >= 0:
+            for i in range(3):
+                moved_points[point, i] = points[point, i] + step[unknown + kept + i]
+                right[p, i] = 0.0
             continue
-        g, rotation = work.by_rig[o], placed.rig_rotation[work.station[s]]
-        for j in range(3):
-            change = rotation[j, 0] * step[0] + rotation[j, 1] * step[1] + rotation[j, 2] * step[2]
-            work.residual[o, 0] += g[0, j] * change
-            work.residual[o, 1] += g[1, j] * change
+        h0 = root[p, 0, 0] * right[p, 0]
+        h1 = root[p, 1, 0] * right[p, 0] + root[p, 1, 1] * right[p, 1]
+        h2 = root[p, 2, 0] * right[p, 0] + root[p, 2, 1] * right[p, 1] + root[p, 2, 2] * right[p, 2]
+        right[p, 0] = -(root[p, 0, 0] * h0 + root[p, 1, 0] * h1 + root[p, 2, 0] * h2)
+        right[p, 1] = -(root[p, 1, 1] * h1 + root[p, 2, 1] * h2)
+        right[p, 2] = -root[p, 2, 2] * h2
+        for i in range(3):
+            moved_points[point, i] = points[point, i] + right[p, i]
 
 
 @kernel
-def track_cost(tracks, track, images, placed, xyz, cauchy, hidden_square, work):
-    """Cost of a point's observations, hidden_square for the squared residual of one that no lens shows; how many."""
-    cost, hidden, last = 0.0, 0, -1
-    image, by_cam, cam = work.small[0], work.small[1:3], work.small[3]
-    q, residual = work.q[0], work.residual[0]
-    for at in range(tracks.start[track], tracks.start[track + 1]):
-        view = tracks.image[at]
-        station, mounting, calibration = images.station[view], images.mounting[view], images.calibration[view]
-        if station != last:
-            last = station
-            to_rig(placed, station, xyz[0], xyz[1], xyz[2], q)
-        pixel, weight = tracks.pixel[at], tracks.weight[at]
-        square = hidden_square
-        if observe(placed, mounting, calibration, q, pixel, weight, cam, image, residual, by_cam):
-            square = residual[0] * residual[0] + residual[1] * residual[1]
-        else:
-            hidden += 1
-        cost += robust(square, cauchy)[0]
+def _predict_by_points(tracks, begin, end, rotation, rays, slots):
+    """Adds to the residuals what the points' steps change."""
+    for p in range(end - begin):
+        x, y, z = slots.right[p, 0], slots.right[p, 1], slots.right[p, 2]
+        for at in range(tracks.start[begin + p], tracks.start[begin + p + 1]):
+            o = at - tracks.start[begin]
+            if rays.slot[o] < 0:
+                continue
+            s = slots.station[rays.slot[o]]
+            for j in range(3):
+                change = rotation[s, j, 0] * x + rotation[s, j, 1] * y + rotation[s, j, 2] * z
+                rays.residual[o, 0] += rays.by_rig[o, 0, j] * change
+                rays.residual[o, 1] += rays.by_rig[o, 1, j] * change
+
+
+@kernel
+def _cost(tracks, begin, end, images, placed, points, cauchy, hidden_square):
+    """Cost of the observations of tracks begin to end, hidden_square for the squared residual of one that no lens
+    shows; how many those are."""
+    cost, hidden = 0.0, 0
+    r, t, c, d, k = (
+        placed.rig_rotation,
+        placed.rig_translation,
+        placed.cam_rotation,
+        placed.cam_translation,
+        placed.parameters,
+    )
+    seen = np.empty(8)
+    for track in range(begin, end):
+        point, last, x, y, z = tracks.point[track], -1, 0.0, 0.0, 0.0
+        px, py, pz = points[point, 0], points[point, 1], points[point, 2]
+        for at in range(tracks.start[track], tracks.start[track + 1]):
+            view = tracks.image[at]
+            s, m, row = images.station[view], images.mounting[view], images.calibration[view]
+            if s != last:
+                last = s
+                x = r[s, 0, 0] * px + r[s, 0, 1] * py + r[s, 0, 2] * pz + t[s, 0]
+                y = r[s, 1, 0] * px + r[s, 1, 1] * py + r[s, 1, 2] * pz + t[s, 1]
+                z = r[s, 2, 0] * px + r[s, 2, 1] * py + r[s, 2, 2] * pz + t[s, 2]
+            u = c[m, 0, 0] * x + c[m, 0, 1] * y + c[m, 0, 2] * z + d[m, 0]
+            v = c[m, 1, 0] * x + c[m, 1, 1] * y + c[m, 1, 2] * z + d[m, 1]
+            w = c[m, 2, 0] * x + c[m, 2, 1] * y + c[m, 2, 2] * z + d[m, 2]
+            square = hidden_square
+            if lens(placed.model[row], k, row, u, v, w, seen):
+                a = (seen[0] * k[row, 0] + k[row, 2] - tracks.pixel[at, 0]) * tracks.weight[at]
+                b = (seen[1] * k[row, 1] + k[row, 3] - tracks.pixel[at, 1]) * tracks.weight[at]
+                square = a * a + b * b
+            else:
+                hidden += 1
+            cost += loss(square, cauchy)
     return cost, hidden
 
 
 @kernel
-def all_cost(tracks, images, placed, points, cauchy, hidden_square, work):
+def all_cost(tracks, images, placed, points, cauchy, hidden_square):
     """Cost of all image observations, and how many no lens shows."""
     cost, hidden = 0.0, 0
-    for track in range(tracks.point.shape[0]):
-        xyz = points[tracks.point[track]]
-        more, unseen = track_cost(tracks, track, images, placed, xyz, cauchy, hidden_square, work)
+    for begin in range(0, tracks.point.shape[0], BATCH):
+        end = min(begin + BATCH, tracks.point.shape[0])
+        more, unseen = _cost(tracks, begin, end, images, placed, points, cauchy, hidden_square)
         cost, hidden = cost + more, hidden + unseen
     return cost, hidden

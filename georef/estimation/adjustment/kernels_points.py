@@ -1,8 +1,9 @@
-"""Compiled kernels of one point at a time: its image observations linearised, the point eliminated or found again.
+"""Compiled kernels over a batch of points: their image observations linearised, summed by station, points inverted.
 
 An observation depends on its station and point through the point q in the rig frame only: with G its derivative (2, 3)
 by q, the derivative by the station is G [[q]x, -I] and by the point G R. So the cameras of a station are first summed
-into G'G (3, 3) and G'r (3,), and elimination works on stations.
+into G'G (3, 3) and G'r (3,), and elimination works on stations. Batches are short enough for the processor's cache and
+long enough that calls cost nothing.
 """
 
 from __future__ import annotations
@@ -13,9 +14,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from georef.estimation.adjustment.kernels import by_shared, kernel, observe
+from georef.estimation.adjustment.kernels import by_unknown, kernel, lens
 from georef.geometry.rigid import Array
 
+BATCH = 128  # points
 _UNDETERMINED, _HELD = 1e-12, 1e-10  # of the trace of a point's normal matrix
 
 
@@ -31,162 +33,264 @@ class Tracks(NamedTuple):
     prior: NDArray[np.int64]  # (T,) row of the point's prior, else -1
 
 
+class Rays(NamedTuple):
+    """Linearised observations of a batch, whitened, weights of the loss applied; n: the most of any batch."""
+
+    residual: Array  # (n, 2)
+    by_rig: Array  # (n, 2, 3) by the point in the rig frame
+    by_cam: Array  # (n, 2, 3) by the point in the camera frame
+    cam: Array  # (n, 3) the point there
+    image: Array  # (n, 2) at unit focal length
+    scale: Array  # (n,) weight of a pixel's residual, that of the loss included
+    slot: NDArray[np.int64]  # (n,) which of the batch's slots; -1 where the lens does not show the point
+    shared: Array  # (n, 2, w) by unknowns of the border
+    column: NDArray[np.int64]  # (n, w) which they are
+    columns: NDArray[np.int64]  # (n,) how many
+
+
+class Slots(NamedTuple):
+    """Pairs of a point and a station, and the points, of a batch."""
+
+    first: NDArray[np.int64]  # (BATCH + 1,) slots of each point
+    station: NDArray[np.int64]  # (n,)
+    q: Array  # (n, 3) the point in the rig frame
+    square: Array  # (n, 3, 3) sum of G'G
+    slope: Array  # (n, 3) sum of G'r
+    mixed: Array  # (n, 3, 3) G'G R
+    eliminated: Array  # (n, 3, 6) E with W N^-1 W' = E' E
+    normal: Array  # (BATCH, 3, 3) of points
+    right: Array  # (BATCH, 3) their gradients
+    root: Array  # (BATCH, 3, 3) inverses of their lower Cholesky factors
+
+
+class Shared(NamedTuple):
+    """The border's unknowns that one point depends on."""
+
+    place: NDArray[np.int64]  # (B,) among the point's, else -1
+    used: NDArray[np.int64]  # (B,)
+    mixed: Array  # (B, 3) W of these
+
+
 class Work(NamedTuple):
-    """What one point needs, made once: t, the most observations of a point, w, the most shared unknowns of one."""
+    """Scratch memory of one pass, made once."""
 
-    residual: Array  # (t, 2) by observation, whitened, as are the derivatives
-    by_rig: Array  # (t, 2, 3)
-    shared: Array  # (t, 2, w)
-    column: NDArray[np.int64]  # (t, w)
-    columns: NDArray[np.int64]  # (t,)
-    slot: NDArray[np.int64]  # (t,) which of the point's stations; -1 where the lens does not show the point
-    station: NDArray[np.int64]  # (t,) by slot
-    q: Array  # (t, 3) the point in the rig frame
-    square: Array  # (t, 3, 3) sum of G'G
-    slope: Array  # (t, 3) sum of G'r
-    mixed: Array  # (t, 3, 3) W N^-1 W' is mixed mixed' of the point q
-    eliminated: Array  # (t, 6, 3) the same of the station
-    normal: Array  # (3, 3) of the point
-    right: Array  # (3,)
-    root: Array  # (3, 3) inverse of the lower Cholesky factor
-    place: NDArray[np.int64]  # (B,) of a border's unknown among the point's, else -1
-    used: NDArray[np.int64]  # (B,) border's unknowns of the point
-    border: Array  # (B, 3) W of these
-    small: Array  # (4, 3) scratch
-    normal6: Array  # (6, 3) scratch
+    rays: Rays
+    slots: Slots
+    shared: Shared
 
 
-def work_for(longest: int, shared: int, border: int) -> Work:
-    t, w, b = max(longest, 1), max(shared, 1), max(border, 1)
+def work_for(start: NDArray[np.int64], shared: int, border: int) -> Work:
+    """For tracks with these starts (T + 1,), `shared` unknowns of the border to an observation at most."""
+    ends = start[np.minimum(np.arange(0, len(start), BATCH) + BATCH, len(start) - 1)]
+    n, w, b = max(int((ends - start[::BATCH]).max(initial=0)), 1), max(shared, 1), max(border, 1)
     f, i = np.zeros, np.int64
     return Work(
-        *(f((t, 2)), f((t, 2, 3)), f((t, 2, w)), f((t, w), i), f(t, i), f(t, i), f(t, i), f((t, 3)), f((t, 3, 3))),
-        *(f((t, 3)), f((t, 3, 3)), f((t, 6, 3)), f((3, 3)), f(3), f((3, 3)), np.full(b, -1), f(b, i), f((b, 3))),
-        f((4, 3)), f((6, 3)),
+        Rays(
+            *(f((n, 2)), f((n, 2, 3)), f((n, 2, 3)), f((n, 3)), f((n, 2)), f(n), f(n, i)),
+            *(f((n, 2, w)), f((n, w), i), f(n, i)),
+        ),
+        Slots(
+            *(f(BATCH + 1, i), f(n, i), f((n, 3)), f((n, 3, 3)), f((n, 3)), f((n, 3, 3)), f((n, 3, 6))),
+            *(f((BATCH, 3, 3)), f((BATCH, 3)), f((BATCH, 3, 3))),
+        ),
+        Shared(np.full(b, -1), f(b, i), f((b, 3))),
     )
 
 
 @kernel
-def to_rig(placed, station, x, y, z, q):
-    r, t = placed.rig_rotation[station], placed.rig_translation[station]
-    for i in range(3):
-        q[i] = r[i, 0] * x + r[i, 1] * y + r[i, 2] * z + t[i]
+def linearize(tracks, begin, end, images, placed, points, cauchy, rays, slots):
+    """Linearises all observations of tracks begin to end; their cost, and how many no lens shows."""
+    count, cost, hidden = 0, 0.0, 0
+    r, t, c, d = placed.rig_rotation, placed.rig_translation, placed.cam_rotation, placed.cam_translation
+    seen = np.empty(8)
+    for track in range(begin, end):
+        slots.first[track - begin] = count
+        point, last = tracks.point[track], -1
+        px, py, pz = points[point, 0], points[point, 1], points[point, 2]
+        for at in range(tracks.start[track], tracks.start[track + 1]):
+            o, view = at - tracks.start[begin], tracks.image[at]
+            s, m, k = images.station[view], images.mounting[view], images.calibration[view]
+            if s != last:
+                last, slots.station[count] = s, s
+                for i in range(3):
+                    slots.q[count, i] = r[s, i, 0] * px + r[s, i, 1] * py + r[s, i, 2] * pz + t[s, i]
+                count += 1
+            x, y, z = slots.q[count - 1, 0], slots.q[count - 1, 1], slots.q[count - 1, 2]
+            u = c[m, 0, 0] * x + c[m, 0, 1] * y + c[m, 0, 2] * z + d[m, 0]
+            v = c[m, 1, 0] * x + c[m, 1, 1] * y + c[m, 1, 2] * z + d[m, 1]
+            w = c[m, 2, 0] * x + c[m, 2, 1] * y + c[m, 2, 2] * z + d[m, 2]
+            rays.columns[o] = 0
+            if not lens(placed.model[k], placed.parameters, k, u, v, w, seen):
+                rays.slot[o] = -1
+                hidden += 1
+                continue
+            rays.slot[o] = count - 1
+            rays.cam[o, 0], rays.cam[o, 1], rays.cam[o, 2] = u, v, w
+            rays.image[o, 0], rays.image[o, 1] = seen[0], seen[1]
+            weight = tracks.weight[at]
+            a = (seen[0] * placed.parameters[k, 0] + placed.parameters[k, 2] - tracks.pixel[at, 0]) * weight
+            b = (seen[1] * placed.parameters[k, 1] + placed.parameters[k, 3] - tracks.pixel[at, 1]) * weight
+            cost += loss(a * a + b * b, cauchy)
+            weight *= root_weight(a * a + b * b, cauchy)
+            rays.scale[o] = weight
+            damp = weight / tracks.weight[at]
+            rays.residual[o, 0], rays.residual[o, 1] = a * damp, b * damp
+            for i in range(2):
+                f = placed.parameters[k, i] * weight
+                e0, e1, e2 = seen[2 + 3 * i] * f, seen[3 + 3 * i] * f, seen[4 + 3 * i] * f
+                rays.by_cam[o, i, 0], rays.by_cam[o, i, 1], rays.by_cam[o, i, 2] = e0, e1, e2
+                for j in range(3):
+                    rays.by_rig[o, i, j] = e0 * c[m, 0, j] + e1 * c[m, 1, j] + e2 * c[m, 2, j]
+    slots.first[end - begin] = count
+    return cost, hidden
 
 
 @kernel
-def linearize_track(tracks, track, images, placed, xyz, cauchy, shared, work):
-    """Fills residuals, derivatives and slots of all observations of a point at xyz (3,); how many stations, the cost,
-    and how many observations no lens shows. Weights of the loss are applied."""
-    slots, cost, hidden = 0, 0.0, 0
-    last = -1
-    image, by_cam, cam, dim = work.small[0], work.small[1:3], work.small[3], 0
-    for at in range(tracks.start[track], tracks.start[track + 1]):
-        o = at - tracks.start[track]
-        view = tracks.image[at]
-        station, mounting, calibration = images.station[view], images.mounting[view], images.calibration[view]
-        if station != last:
-            last = station
-            work.station[slots] = station
-            to_rig(placed, station, xyz[0], xyz[1], xyz[2], work.q[slots])
-            slots += 1
-        q, residual = work.q[slots - 1], work.residual[o]
-        weight = tracks.weight[at]
-        if not observe(placed, mounting, calibration, q, tracks.pixel[at], weight, cam, image, residual, by_cam):
-            work.slot[o] = -1
-            hidden += 1
-            continue
-        work.slot[o] = slots - 1
-        loss, damp = robust(residual[0] * residual[0] + residual[1] * residual[1], cauchy)
-        cost += loss
-        if shared:
-            dim = by_shared(images, placed, mounting, calibration, cam, image, weight, by_cam, work.shared[o], work.column[o])
-            work.columns[o] = dim
-        _to_rig_derivative(placed.cam_rotation[mounting], by_cam, damp, residual, work.by_rig[o], work.shared[o], dim)
-    return slots, cost, hidden
-
-
-@kernel
-def robust(square, cauchy):
-    """Cost of a squared whitened norm and the root of its weight; no loss where the scale is 0."""
+def loss(square, cauchy):
+    """Cost of a squared whitened norm; no loss where the scale is 0."""
     if cauchy <= 0.0:
-        return 0.5 * square, 1.0
-    ratio = square / (cauchy * cauchy)
-    return 0.5 * cauchy * cauchy * log1p(ratio), sqrt(1.0 / (1.0 + ratio))
+        return 0.5 * square
+    return 0.5 * cauchy * cauchy * log1p(square / (cauchy * cauchy))
 
 
 @kernel
-def _to_rig_derivative(rotation, by_cam, damp, residual, by_rig, shared, dim):
-    for i in range(2):
-        residual[i] *= damp
-        for j in range(3):
-            by_rig[i, j] = damp * (
-                by_cam[i, 0] * rotation[0, j] + by_cam[i, 1] * rotation[1, j] + by_cam[i, 2] * rotation[2, j]
-            )
-        for j in range(dim):
-            shared[i, j] *= damp
+def root_weight(square, cauchy):
+    """Root of the weight that the loss gives an observation."""
+    return 1.0 if cauchy <= 0.0 else sqrt(1.0 / (1.0 + square / (cauchy * cauchy)))
 
 
 @kernel
-def sum_stations(count, slots, work):
-    """G'G and G'r of the stations of a point from its `count` observations."""
-    for s in range(slots):
-        work.square[s, :, :] = 0.0
-        work.slope[s, :] = 0.0
+def share(tracks, begin, end, images, placed, rays):
+    """Derivatives of a batch's observations by mountings and calibrations, where these are unknown."""
+    offset = tracks.start[begin]
+    for at in range(offset, tracks.start[end]):
+        o, count = at - offset, 0
+        if rays.slot[o] < 0:
+            continue
+        mounting, k = images.mounting[tracks.image[at]], images.calibration[tracks.image[at]]
+        x, y, z = rays.cam[o, 0], rays.cam[o, 1], rays.cam[o, 2]
+        first = images.mounting_column[mounting]
+        if first >= 0:
+            for i in range(2):
+                a, b, c = rays.by_cam[o, i, 0], rays.by_cam[o, i, 1], rays.by_cam[o, i, 2]
+                rays.shared[o, i, 0] = b * z - c * y
+                rays.shared[o, i, 1] = c * x - a * z
+                rays.shared[o, i, 2] = a * y - b * x
+                rays.shared[o, i, 3], rays.shared[o, i, 4], rays.shared[o, i, 5] = -a, -b, -c
+            for j in range(6):
+                rays.column[o, j] = first + j
+            count = 6
+        first = images.calibration_column[k]
+        if first >= 0:
+            for j in range(images.unknowns[k]):
+                code, model = images.code[k, j], placed.model[k]
+                a, b = by_unknown(code, model, placed.parameters, k, x, y, z, rays.image[o, 0], rays.image[o, 1])
+                rays.shared[o, 0, count], rays.shared[o, 1, count] = a * rays.scale[o], b * rays.scale[o]
+                rays.column[o, count] = first + j
+                count += 1
+        rays.columns[o] = count
+
+
+@kernel
+def keep(tracks, begin, end, placed, rays, slots):
+    """Appends the derivatives by points that are not eliminated to those by unknowns of the border."""
+    for track in range(begin, end):
+        kept = tracks.kept[track]
+        if kept < 0:
+            continue
+        for o in range(tracks.start[track] - tracks.start[begin], tracks.start[track + 1] - tracks.start[begin]):
+            if rays.slot[o] < 0:
+                continue
+            s, at = slots.station[rays.slot[o]], rays.columns[o]
+            for j in range(3):
+                for i in range(2):
+                    total = 0.0
+                    for k in range(3):
+                        total += rays.by_rig[o, i, k] * placed.rig_rotation[s, k, j]
+                    rays.shared[o, i, at + j] = total
+                rays.column[o, at + j] = kept + j
+            rays.columns[o] = at + 3
+
+
+@kernel
+def sum_stations(count, slot_count, rays, slots):
+    """G'G and G'r of all slots of a batch from its `count` observations."""
+    for s in range(slot_count):
+        for i in range(3):
+            slots.slope[s, i] = 0.0
+            for j in range(3):
+                slots.square[s, i, j] = 0.0
     for o in range(count):
-        s = work.slot[o]
+        s = rays.slot[o]
         if s < 0:
             continue
-        g, r, square, slope = work.by_rig[o], work.residual[o], work.square[s], work.slope[s]
+        u, v = rays.residual[o, 0], rays.residual[o, 1]
         for i in range(3):
-            slope[i] += g[0, i] * r[0] + g[1, i] * r[1]
+            a, b = rays.by_rig[o, 0, i], rays.by_rig[o, 1, i]
+            slots.slope[s, i] += a * u + b * v
             for j in range(3):
-                square[i, j] += g[0, i] * g[0, j] + g[1, i] * g[1, j]
+                slots.square[s, i, j] += a * rays.by_rig[o, 0, j] + b * rays.by_rig[o, 1, j]
 
 
 @kernel
-def point_normal(slots, placed, work):
-    """Normal matrix and gradient of a point; leaves G'G R in `mixed`."""
-    work.normal[:, :] = 0.0
-    work.right[:] = 0.0
-    for s in range(slots):
-        r, m, x = placed.rig_rotation[work.station[s]], work.square[s], work.mixed[s]
-        g = work.slope[s]
+def point_normals(tracks, begin, end, placed, points, information, shift, damping, slots):
+    """Normal matrices and gradients of a batch's points, priors included, and the inverse roots of the damped ones; how
+    many points their rays leave undetermined."""
+    loose = 0
+    for p in range(end - begin):
         for i in range(3):
+            slots.right[p, i] = 0.0
             for j in range(3):
-                x[i, j] = m[i, 0] * r[0, j] + m[i, 1] * r[1, j] + m[i, 2] * r[2, j]
-        for i in range(3):
-            work.right[i] += r[0, i] * g[0] + r[1, i] * g[1] + r[2, i] * g[2]
+                slots.normal[p, i, j] = 0.0
+        for s in range(slots.first[p], slots.first[p + 1]):
+            station = slots.station[s]
             for j in range(3):
-                work.normal[i, j] += r[0, i] * x[0, j] + r[1, i] * x[1, j] + r[2, i] * x[2, j]
-
-
-@kernel
-def add_prior(information, shift, xyz, work):
-    """Adds a given coordinate: information (3, 3), its product with the given position (3,)."""
-    for i in range(3):
-        for j in range(3):
-            work.normal[i, j] += information[i, j]
-            work.right[i] += information[i, j] * xyz[j]
-        work.right[i] -= shift[i]
-
-
-@kernel
-def invert_root(normal, damping, root):
-    """Inverse of the lower Cholesky factor of a point's damped normal matrix (3, 3).
-
-    A direction that rays leave open (one ray, or none across) is held by next to nothing; True where that is so.
-    """
-    a, b, c = normal[0, 0] * (1 + damping), normal[1, 1] * (1 + damping), normal[2, 2] * (1 + damping)
-    trace = a + b + c
-    loose = _root(a, b, c, normal[1, 0], normal[2, 0], normal[2, 1], _UNDETERMINED * trace, root)
-    if loose:
-        held = _HELD * trace if trace > 0.0 else 1.0
-        _root(a + held, b + held, c + held, normal[1, 0], normal[2, 0], normal[2, 1], 0.0, root)
+                r0, r1, r2 = (
+                    placed.rig_rotation[station, 0, j],
+                    placed.rig_rotation[station, 1, j],
+                    placed.rig_rotation[station, 2, j],
+                )
+                slots.right[p, j] += r0 * slots.slope[s, 0] + r1 * slots.slope[s, 1] + r2 * slots.slope[s, 2]
+                for i in range(3):
+                    m = slots.square[s, i, 0] * r0 + slots.square[s, i, 1] * r1 + slots.square[s, i, 2] * r2
+                    slots.mixed[s, i, j] = m
+            for i in range(3):
+                for j in range(3):
+                    total = 0.0
+                    for k in range(3):
+                        total += placed.rig_rotation[station, k, i] * slots.mixed[s, k, j]
+                    slots.normal[p, i, j] += total
+        row, point = tracks.prior[begin + p], tracks.point[begin + p]
+        if row >= 0:
+            for i in range(3):
+                slots.right[p, i] -= shift[row, i]
+                for j in range(3):
+                    slots.normal[p, i, j] += information[row, i, j]
+                    slots.right[p, i] += information[row, i, j] * points[point, j]
+        if tracks.kept[begin + p] < 0:
+            loose += invert_root(slots.normal, p, damping, slots.root)
     return loose
 
 
 @kernel
-def _root(a, b, c, ba, ca, cb, least, root):
+def invert_root(normal, p, damping, root):
+    """Inverse of the lower Cholesky factor of a point's damped normal matrix (P, 3, 3).
+
+    A direction that rays leave open (one ray, or none across) is held by next to nothing; True where that is so.
+    """
+    factor = 1.0 + damping
+    a, b, c = normal[p, 0, 0] * factor, normal[p, 1, 1] * factor, normal[p, 2, 2] * factor
+    trace = a + b + c
+    loose = _root(a, b, c, normal[p, 1, 0], normal[p, 2, 0], normal[p, 2, 1], _UNDETERMINED * trace, p, root)
+    if loose:
+        held = _HELD * trace if trace > 0.0 else 1.0
+        a, b, c = a + held, b + held, c + held
+        _root(a, b, c, normal[p, 1, 0], normal[p, 2, 0], normal[p, 2, 1], 0.0, p, root)
+    return loose
+
+
+@kernel
+def _root(a, b, c, ba, ca, cb, least, p, root):
     if not a > least:
         return True
     l00 = sqrt(a)
@@ -199,9 +303,9 @@ def _root(a, b, c, ba, ca, cb, least, root):
     pivot = c - l20 * l20 - l21 * l21
     if not pivot > least:
         return True
-    l22 = sqrt(pivot)
-    root[0, 0], root[1, 1], root[2, 2] = 1.0 / l00, 1.0 / l11, 1.0 / l22
-    root[1, 0] = -l10 * root[0, 0] / l11
-    root[2, 1] = -l21 * root[1, 1] / l22
-    root[2, 0] = -(l20 * root[0, 0] + l21 * root[1, 0]) / l22
+    r0, r1, r2 = 1.0 / l00, 1.0 / l11, 1.0 / sqrt(pivot)
+    root[p, 0, 0], root[p, 1, 1], root[p, 2, 2] = r0, r1, r2
+    root[p, 1, 0] = -l10 * r0 * r1
+    root[p, 2, 1] = -l21 * r1 * r2
+    root[p, 2, 0] = -(l20 * r0 + l21 * root[p, 1, 0]) * r2
     return False

@@ -63,8 +63,7 @@ class Prepared:
         return Prepared(layout, tracks, _images(block, layout), order, first, column)
 
     def work(self) -> Work:
-        longest = int(np.diff(self.tracks.start).max(initial=0))
-        return work_for(longest, 6 + self.images.code.shape[1] + 3, self.layout.border)
+        return work_for(self.tracks.start, 6 + self.images.code.shape[1] + 3, self.layout.border)
 
 
 def placed(state: State) -> Placed:
@@ -138,9 +137,7 @@ def counting_order(key, count):
     return order
 
 
-def station_pairs(
-    tracks: Tracks, station: NDArray[np.int32], layout: Layout, tied: Indices
-) -> tuple[Indices, Indices]:
+def station_pairs(tracks: Tracks, station: NDArray[np.int32], layout: Layout, tied: Indices) -> tuple[Indices, Indices]:
     """The pattern (first, column) of `Reduced`; tied (K, 2): further pairs, the smaller station first."""
     at_station, track, slot = _incidence(tracks.start, tracks.image, tracks.kept, station)
     by_station = counting_order(at_station, layout.stations)

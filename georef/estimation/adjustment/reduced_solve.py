@@ -1,4 +1,4 @@
-"""Solution of the reduced normal equations: stations by a sparse Cholesky factor, the border by its Schur complement."""
+"""Solution of the reduced normal equations: stations by a sparse Cholesky factor, border by its Schur complement."""
 
 from __future__ import annotations
 
