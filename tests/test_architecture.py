@@ -54,10 +54,11 @@ ALLOWED: dict[str, set[str]] = {
     "cli_weights": {"errors", "terminal", "doctor", "features"},
     "cli_benchmark": {"errors", "terminal", "io", "benchmarks"},
     "cli_options": {"executor", "progress", "project"},
+    "cli_adjust": {"cli_options", "terminal", "project", "stages", "pipeline"},
     "cli_evaluate": {"cli_options", "comparison", "stages", "terminal"},
     "cli": {
         *("errors", "terminal", "cli_options", "cli_weights", "cli_benchmark", "cli_evaluate", "doctor", "project"),
-        *("pipeline", "stages", "viewer", "capture", "simulate"),
+        *("pipeline", "stages", "viewer", "capture", "simulate", "cli_adjust"),
     },
 }
 FOLDER_NAMES = {"work", "epochs", "campaigns"}  # inside a project
