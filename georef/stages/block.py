@@ -13,7 +13,7 @@ import numpy as np
 from georef import __version__
 from georef.config import AdjustConfig
 from georef.estimation.adjustment.block import Block, State
-from georef.estimation.adjustment.block_check import common_offset
+from georef.estimation.adjustment.block_check import common_offset, with_points_as_control
 from georef.estimation.adjustment.block_correlations import (
     Correlation,
     ground_height_correlations,
@@ -28,6 +28,7 @@ from georef.estimation.adjustment.block_solutions import (
     solved,
     without_offset,
 )
+from georef.evaluation.check_points import CheckPointErrors
 from georef.evaluation.splits import spread_splits
 from georef.evaluation.statistics import summarize_nees
 from georef.geometry.camera import Camera
@@ -87,7 +88,8 @@ def run(project: Project, name: str, say: Say = lambda _: None) -> BlockRun:
         say("offset between GNSS and surveyed points")
         report["offset"] = _offset(survey, cleaned, config)
     if section.hold_out is not None and section.hold_out.control < len(survey.surveyed):
-        report["hold_out"] = _hold_out(survey, declared, config, section.hold_out, say)
+        say("splits into control and check points")
+        report["hold_out"] = _hold_out(survey, declared, config, section.hold_out)
     if section.compare is not None:
         report["comparison"] = _comparison(project, section.compare.camera, final, section.compare.format)
     report["timing"] = meter.read()
@@ -196,35 +198,36 @@ def _offset(survey: BlockSurvey, cleaned: CleanBlock, config: AdjustConfig) -> d
     }
 
 
-def _hold_out(
-    survey: BlockSurvey, declared: CleanBlock, config: AdjustConfig, hold_out: HoldOut, say: Say
-) -> dict[str, Any]:
-    """Splits into control and check points: what the check points say of each."""
-    positions = np.array([point.point_in_world for point in survey.surveyed])
-    names = [point.point_id for point in survey.surveyed]
-    splits = []
-    for number, split in enumerate(spread_splits(positions[:, :2], hold_out.control, hold_out.count), start=1):
-        control = tuple(names[i] for i in split)
-        say(f"split {number} of {hold_out.count}: control {', '.join(control)}")
-        found = solve_with_control(declared, *_split(survey, control), config)
-        errors = found.check.errors.determined
-        splits.append(
-            {
-                "control": list(control),
-                "check": [error.point_id for error in errors],
-                "rmse_m": _rms(np.array([error.difference_m for error in errors])),
-                "differences_m": [error.difference_m.tolist() for error in errors],
-                "nees": [error.nees for error in errors],
-                "offset_m": found.solution.state.drift_m.tolist(),
-                "converged": found.solution.converged,
-            }
-        )
+def _hold_out(survey: BlockSurvey, declared: CleanBlock, config: AdjustConfig, hold_out: HoldOut) -> dict[str, Any]:
+    """Splits into control and check points: what the check points say of each.
+
+    One solution without control tells how all surveyed points and the block hang together, and so what each choice of
+    control does; the first split is adjusted as well, and the report says how far the two differ.
+    """
+    free = solve_with_control(declared, (), survey.check(()), config).check
+    names = [error.point_id for error in free.errors.determined]
+    positions = {point.point_id: point.point_in_world[:2] for point in survey.surveyed}
+    chosen = spread_splits(np.array([positions[name] for name in names]), hold_out.control, hold_out.count)
+    splits = [_split_result(with_points_as_control(free, split), [names[i] for i in split]) for split in chosen]
+    adjusted = solve_with_control(declared, *_split(survey, splits[0]["control"]), config).check.errors
+    again = np.array([error.difference_m for error in adjusted.determined])
     values = [value for split in splits for value in split["nees"]]
     return {
         "splits": splits,
         "median_rmse_m": np.median([split["rmse_m"] for split in splits], axis=0).tolist(),
         "largest_rmse_m": np.max([split["rmse_m"] for split in splits], axis=0).tolist(),
         "nees": summarize_nees(values, 3, effective_dof=3.0 * len(names)).to_dict(),
+        "first_split_adjusted_differs_m": float(np.abs(again - splits[0]["differences_m"]).max()),
+    }
+
+
+def _split_result(errors: CheckPointErrors, control: list[str]) -> dict[str, Any]:
+    return {
+        "control": control,
+        "check": [error.point_id for error in errors.determined],
+        "rmse_m": _rms(np.array([error.difference_m for error in errors.determined])),
+        "differences_m": [error.difference_m.tolist() for error in errors.determined],
+        "nees": [error.nees for error in errors.determined],
     }
 
 

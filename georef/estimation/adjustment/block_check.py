@@ -8,7 +8,7 @@ the inverse of the reduced normal matrix and G the derivative of the intersected
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import cast
 
 import numpy as np
@@ -91,6 +91,32 @@ def common_offset(check: BlockCheck) -> Offset | None:
     rest = differences - shared @ offset
     dof = max(3 * len(errors) - 3, 1)
     return Offset(offset, cov, float(offset @ np.linalg.solve(cov, offset)), float(rest @ weight @ rest) / dof)
+
+
+def with_points_as_control(check: BlockCheck, control: Sequence[int]) -> CheckPointErrors:
+    """What the differences of the other points become where those of some (by index among the determined) are used.
+
+    The block follows surveyed points as far as its own covariance lets it: with differences d and their joint
+    covariance C, d_x - C_xc C_cc^-1 d_c and C_xx - C_xc C_cc^-1 C_cx. To first order this is the adjustment with these
+    points as control, whose marks and coordinates are in C_cc; corrections of centimetres are small enough for it.
+    """
+    errors, joint = check.errors.determined, check.errors.joint_cov
+    assert joint is not None, "a block that was checked knows its covariance"
+    others = [i for i in range(len(errors)) if i not in set(control)]
+    rows, used = (
+        np.array([3 * i + k for i in chosen for k in range(3)], dtype=np.int64) for chosen in (others, control)
+    )
+    differences = np.concatenate([error.difference_m for error in errors])
+    gain = np.linalg.solve(joint[np.ix_(used, used)], joint[np.ix_(used, rows)]).T
+    left = differences[rows] - gain @ differences[used]
+    cov = symmetric(joint[np.ix_(rows, rows)] - gain @ joint[np.ix_(used, rows)])
+    changed = [
+        replace(
+            errors[i], difference_m=left[3 * k : 3 * k + 3], predicted_cov=cov[3 * k : 3 * k + 3, 3 * k : 3 * k + 3]
+        )
+        for k, i in enumerate(others)
+    ]
+    return CheckPointErrors(tuple(changed), check.errors.not_determined, cov)
 
 
 def _derivative(
