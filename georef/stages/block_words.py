@@ -83,7 +83,7 @@ def _hold_out_lines(hold_out: dict[str, Any]) -> list[str]:
         f"{len(splits)} splits into {len(first['control'])} control and {len(first['check'])} check points:",
         f"  RMSE of check points E/N/H, median {_cm(hold_out['median_rmse_m'])}, "
         f"largest {_cm(hold_out['largest_rmse_m'])}",
-        f"  the first one adjusted as a whole differs by {1e3 * hold_out['first_split_adjusted_differs_m']:.2f} mm or less",
+        f"  the first one, adjusted, differs by {1e3 * hold_out['first_split_adjusted_differs_m']:.2f} mm or less",
         f"  {_nees(hold_out['nees'])}",
     ]
 
