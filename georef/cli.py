@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from cyclopts import App, Parameter
 
 from georef import __version__
+from georef.cli_adjust import adjust
 from georef.cli_benchmark import benchmark
 from georef.cli_evaluate import evaluate
 from georef.cli_options import (
@@ -48,6 +49,7 @@ app = App(
 app.command(weights)
 app.command(benchmark)
 app.command(evaluate)
+app.command(adjust)
 
 
 @app.command

@@ -47,11 +47,13 @@ def check_machine() -> Iterator[Finding]:
 
 
 def check_project(project: Project) -> Iterator[Finding]:
-    """The configuration's components, space for results, and all tables of all epochs."""
+    """The configuration's components, space for results, and all tables of all epochs and blocks."""
     yield from _components(project)
     yield check_space(project.output)
     for epoch in project.file.epochs:
         yield from _epoch(project, epoch)
+    for block in project.file.blocks:
+        yield from _block(project, block)
 
 
 def _python() -> Finding:
@@ -182,6 +184,22 @@ def _epoch(project: Project, epoch: str) -> Iterator[Finding]:
         return
     yield from _places(survey)
     yield _points(survey, epoch)
+
+
+def _block(project: Project, name: str) -> Iterator[Finding]:
+    from georef.stages.block_survey import load_block
+
+    try:
+        survey = load_block(project, name)
+    except GeorefError as error:
+        yield _failed(error)
+        return
+    yield Finding("ok", _crs_text(survey.world.describe()))
+    block, control = survey.block, len(survey.declared_control)
+    text = f"block {name}: {len(block.image_ids)} images over {_area(block.world_from_rig.translation)}, "
+    text += f"{len(block.points)} tie points, {len(block.observations)} measurements; "
+    text += f"{control} control and {len(survey.surveyed) - control} check points"
+    yield Finding("ok", text)
 
 
 def _failed(error: GeorefError) -> Finding:

@@ -13,28 +13,12 @@ from pydantic import Field, field_validator, model_validator
 
 from georef.config import Config, Section, load_config, merge, parse_overrides, read_toml, validated
 from georef.errors import ConfigError
+from georef.sections import AngleConvention, AngleUnit, BlockSection, CrsSection, TableSection
 
 PROJECT_FILE = "project.toml"
-AngleConvention = Literal["omega-phi-kappa", "yaw-pitch-roll"]
-AngleUnit = Literal["deg", "gon", "rad"]
 Unknown = Literal["focal", "k1", "k2", "cx", "cy", "aspect"]
 REFERENCE = "reference"  # the name of the only reference epoch of a project
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]*")
-
-
-class CrsSection(Section):
-    horizontal: str
-    height: str | None = None
-    origin: tuple[float, float, float] | None = None
-
-
-class TableSection(Section):
-    """How a table is written, where detection is not enough."""
-
-    delimiter: str | None = None
-    decimal: Literal[".", ","] | None = None
-    encoding: str | None = None
-    columns: dict[str, str] = Field(default_factory=dict)
 
 
 class ReferenceSigma(Section):
@@ -132,7 +116,7 @@ class EpochSection(Section):
 
 class PointsSection(Section):
     coordinates: str
-    marks: dict[str, str]
+    marks: dict[str, str] = Field(default_factory=dict)
     check_kind: Literal["absolute", "relative"]
     table: TableSection = TableSection()
 
@@ -144,12 +128,13 @@ class ProjectFile(Section):
     crs: CrsSection
     reference: ReferenceSection | None = None
     references: dict[str, ReferenceSection] = Field(default_factory=dict)
-    epochs: dict[str, EpochSection] = Field(min_length=1)
+    epochs: dict[str, EpochSection] = Field(default_factory=dict)
+    blocks: dict[str, BlockSection] = Field(default_factory=dict)
     points: PointsSection | None = None
     preset: str = "default"
     config: dict[str, Any] = Field(default_factory=dict)
 
-    @field_validator("epochs", "references")
+    @field_validator("epochs", "references", "blocks")
     @classmethod
     def _epoch_names(cls, epochs: dict[str, Any]) -> dict[str, Any]:
         for name in epochs:
@@ -159,11 +144,13 @@ class ProjectFile(Section):
 
     @model_validator(mode="after")
     def _references(self) -> ProjectFile:
-        if (self.reference is None) == (not self.references):
+        if not self.epochs and not self.blocks:
+            raise ValueError("a project has a section [epochs.NAME], or [blocks.NAME] where there are no images")
+        if self.epochs and (self.reference is None) == (not self.references):
             raise ValueError("a project has a section [reference], or one [references.NAME] for each reference epoch")
-        both = set(self.references) & set(self.epochs)
-        if both:
-            raise ValueError(f"a reference epoch and a new epoch have the same name: {', '.join(sorted(both))}")
+        names = [*self.references, *self.epochs, *self.blocks]
+        if both := sorted({name for name in names if names.count(name) > 1}):
+            raise ValueError(f"a reference epoch and a new epoch or block have the same name: {', '.join(both)}")
         estimated = {name for name, section in self.reference_epochs.items() if section.sigma == "estimate"}
         if 0 < len(estimated) < len(self.reference_epochs):
             raise ValueError(
@@ -196,8 +183,9 @@ class Project:
     output: Path
 
     def data(self, name: str) -> Path:
-        """A file that the project declares, relative to the data root."""
-        return self.data_root / name
+        """A file that the project declares: in the data root, else one that lies beside project.toml."""
+        own = self.folder / name
+        return own if own.is_file() and not (self.data_root / name).exists() else self.data_root / name
 
     def stage_folder(self, epoch: str, stage: str, fingerprint: str) -> Path:
         return self.output / "work" / epoch / stage / fingerprint
@@ -224,15 +212,21 @@ class Project:
 
     def select_epoch(self, epoch: str | None) -> str:
         """The epoch that is named, or the only one there is."""
-        names = list(self.file.epochs)
-        if epoch is None and len(names) == 1:
+        return self._select("epoch", list(self.file.epochs), epoch)
+
+    def select_block(self, block: str | None) -> str:
+        """The block that is named, or the only one there is."""
+        return self._select("block", list(self.file.blocks), block)
+
+    def _select(self, what: str, names: list[str], wanted: str | None) -> str:
+        if wanted is None and len(names) == 1:
             return names[0]
-        if epoch not in names:
-            raise ConfigError(
-                f"There is no epoch '{epoch}'." if epoch else "The project has several epochs.",
-                f"Name one with --epoch: {', '.join(names)}.",
-            )
-        return epoch
+        if not names:
+            raise ConfigError(f"The project has no {what}s.", "Blocks go by `georef adjust`, epochs by `georef run`.")
+        if wanted not in names:
+            problem = f"There is no {what} '{wanted}'." if wanted else f"The project has several {what}s."
+            raise ConfigError(problem, f"Name one with --epoch: {', '.join(names)}.")
+        return wanted
 
 
 def open_project(
@@ -287,7 +281,8 @@ def _data_root(file: ProjectFile, folder: Path, data: Path | None) -> Path:
     else:
         named = Path(environment) if environment else None
         tried = [*([named, named / folder.name] if named else []), folder]
-    wanted = next(iter(file.reference_epochs.values())).exterior_orientation
+    tables = [section.exterior_orientation for section in file.reference_epochs.values()]
+    wanted = [*tables, *(section.observations.file for section in file.blocks.values())][0]
     for root in tried:
         if (root / wanted).is_file():
             return root.resolve()

@@ -21,7 +21,8 @@ ALLOWED: dict[str, set[str]] = {
     "types": {"geometry"},
     "crs": {"errors", "geometry"},
     "config": {"errors"},
-    "project": {"errors", "config"},
+    "sections": {"config"},
+    "project": {"errors", "config", "sections"},
     "executor": {"errors"},
     "progress": set(),
     "io": {"errors", "replacing", "pictures", "geometry", "types", "crs"},
@@ -36,7 +37,7 @@ ALLOWED: dict[str, set[str]] = {
     "viewer": {"errors", "config", "replacing", "pictures", "geometry", "types", "features", "report"},
     "stages": {
         *("errors", "cache", "config", "project", "executor", "geometry", "types", "crs", "io", "features", "store"),
-        *("evaluation", "estimation", "capture", "simulate", "report", "viewer"),
+        *("evaluation", "estimation", "capture", "simulate", "report", "viewer", "sections"),
     },
     # measures what lies below the pipeline
     "benchmarks": {
@@ -53,10 +54,11 @@ ALLOWED: dict[str, set[str]] = {
     "cli_weights": {"errors", "terminal", "doctor", "features"},
     "cli_benchmark": {"errors", "terminal", "io", "benchmarks"},
     "cli_options": {"executor", "progress", "project"},
+    "cli_adjust": {"cli_options", "terminal", "project", "stages", "pipeline"},
     "cli_evaluate": {"cli_options", "comparison", "stages", "terminal"},
     "cli": {
         *("errors", "terminal", "cli_options", "cli_weights", "cli_benchmark", "cli_evaluate", "doctor", "project"),
-        *("pipeline", "stages", "viewer", "capture", "simulate"),
+        *("pipeline", "stages", "viewer", "capture", "simulate", "cli_adjust"),
     },
 }
 FOLDER_NAMES = {"work", "epochs", "campaigns"}  # inside a project

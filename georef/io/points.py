@@ -31,16 +31,20 @@ def read_points(
     crs_kind: CrsKind,
     columns: Mapping[str, str] | None = None,
     table_format: TableFormat | None = None,
+    role: PointRole | None = None,
 ) -> PointTable:
     """Read point, role (control or check), position, three sigmas (m) and optionally kind (absolute or relative).
 
+    role: that of all points of a table without such a column, where something else says who takes part.
     Raises InputError for columns that are missing, values that cannot be, unknown roles, sigmas that are not
     positive, and points that are listed twice.
     """
     table = read_table(path, columns=columns, table_format=table_format)
-    require_columns(table, crs_kind, ("point", "role", *SIGMA_COLUMNS[crs_kind]))
+    named = role is None or table.has("role")
+    require_columns(table, crs_kind, ("point", *(("role",) if named else ()), *SIGMA_COLUMNS[crs_kind]))
     point_ids = table.unique_ids("point")
-    roles = cast(tuple[PointRole, ...], table.choices("role", ("control", "check")))
+    roles = table.choices("role", ("control", "check")) if named else (role,) * len(table)
+    roles = cast(tuple[PointRole, ...], roles)
     return PointTable(
         path=table.path,
         declared=table.declared,

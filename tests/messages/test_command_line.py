@@ -27,6 +27,7 @@ VERBS = [
     "init",
     "doctor",
     "run",
+    "adjust",
     "demo",
     "status",
     "report",

@@ -1,0 +1,64 @@
+"""Headings of images that look down."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from georef.estimation.vertical_start import vertical_start
+from georef.geometry.camera import Camera, project
+from georef.geometry.poses import Poses, exp_so3, log_so3s
+from georef.types.scene import Observations
+from tests.worlds.aerial import Flight, flight
+
+_NOMINAL = Camera("n", 4000, 3000, 4000.0, 4000.0, 2000.0, 1500.0)
+
+
+def _observed(made: Flight, rng: np.random.Generator, *, wrong: float = 0.0) -> Observations:
+    point, view, pixel = [], [], []
+    for k, pose in enumerate(made.world_from_cam.to_list()):
+        px = project(_NOMINAL, pose.inverse().apply(made.points))
+        seen = np.flatnonzero(((px > 0) & (px < [4000, 3000])).all(axis=1))
+        blunder = rng.random(len(seen)) < wrong
+        px[seen[blunder]] = rng.uniform(0, 3000, (int(blunder.sum()), 2))
+        point.append(seen)
+        view.append(np.full(len(seen), k))
+        pixel.append(px[seen])
+    count = sum(map(len, point))
+    return Observations(*map(np.concatenate, (point, view, pixel)), np.ones(count), np.full(count, -1))
+
+
+def _off_deg(made: Flight, found: Poses) -> np.ndarray:
+    turned = np.swapaxes(found.rotation, 1, 2) @ made.world_from_cam.rotation
+    return np.degrees(np.linalg.norm(log_so3s(turned), axis=1))
+
+
+def test_rotations_are_found_but_for_the_tilt() -> None:
+    made, rng = flight(), np.random.default_rng(0)
+    start = vertical_start(made.world_from_cam.translation, [_NOMINAL] * 28, _observed(made, rng))
+    off = _off_deg(made, start.world_from_cam)
+    assert 1.0 < np.median(off) < 5.0  # the tilt itself is two degrees about each axis
+    assert off.max() < 12.0
+    assert start.misfit.max() < 0.1
+
+
+def test_blunders_do_little() -> None:
+    made, rng = flight(), np.random.default_rng(0)
+    start = vertical_start(made.world_from_cam.translation, [_NOMINAL] * 28, _observed(made, rng, wrong=0.1))
+    assert _off_deg(made, start.world_from_cam).max() < 15.0
+
+
+def test_images_that_look_ahead_do_not_fit_a_map() -> None:
+    made, rng = flight(), np.random.default_rng(0)
+    ahead = made.world_from_cam.rotation @ exp_so3(np.array([[np.radians(35.0), 0.0, 0.0]]))
+    tilted = Flight(Poses(ahead, made.world_from_cam.translation), made.points, made.surveyed, made.offset_m)
+    start = vertical_start(made.world_from_cam.translation, [_NOMINAL] * 28, _observed(tilted, rng))
+    level = vertical_start(made.world_from_cam.translation, [_NOMINAL] * 28, _observed(made, rng))
+    assert np.nanmedian(start.misfit) > 2.0 * np.median(level.misfit)
+
+
+def test_an_image_without_common_points_has_no_heading() -> None:
+    made, rng = flight(), np.random.default_rng(0)
+    observed = _observed(made, rng)
+    start = vertical_start(made.world_from_cam.translation, [_NOMINAL] * 28, observed.take(observed.view != 3))
+    assert np.isnan(start.misfit[3])
+    assert np.isfinite(np.delete(start.misfit, 3)).all()
