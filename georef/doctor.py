@@ -248,10 +248,24 @@ def _cameras(survey: Survey) -> Iterator[Finding]:
         counts = Counter(camera.camera_id for camera in cameras)
         listed = ", ".join(f"{count} {camera_id}" for camera_id, count in list(counts.items())[:6])
         yield Finding("ok", f"epoch {name}: images of {len(counts)} cameras: {listed}")
+    if survey.epoch.mountings and not survey.cutouts:
+        yield _rig(survey)
     wrong = sorted({c.source.name for c in survey.cutouts if not is_panorama(c.source, c.projection)})
     if wrong:
         text = f"{len(wrong)} images are no panoramas of their declared projection: {', '.join(wrong[:5])}"
         yield Finding("warning", text, "Their heads will be rejected: correct panorama.projection, or the images.")
+
+
+def _rig(survey: Survey) -> Finding:
+    """How many images are exposures of a rig, and of how many cameras each."""
+    epoch, mounted = survey.epoch, survey.epoch.mountings
+    exposures = Counter(image.station for image in epoch.images if image.image_id in mounted)
+    sizes = Counter(exposures.values())
+    listed = ", ".join(f"{number} of {size} images" for size, number in sorted(sizes.items(), reverse=True))
+    text = f"epoch {epoch.epoch}: {len(exposures)} exposures of a rig ({listed})"
+    if set(sizes) != {1}:
+        return Finding("ok", text)
+    return Finding("warning", text, "No exposure has two images: is the column 'station' equal for images of one?")
 
 
 def _points(survey: Survey, epoch: str) -> Finding:

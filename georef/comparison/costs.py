@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from georef.comparison.run import LAST_STAGE, StageCost, VariantRun
+from georef.comparison.run import LOCALIZE, StageCost, VariantRun
 from georef.evaluation.tables import Cell, Column, Table
 from georef.stages.base import open_features
 
@@ -34,10 +34,12 @@ _STORAGE = (
 
 def runtime_table(runs: Mapping[str, VariantRun]) -> Table:
     """Processor time by step: of the stages before localization, and of the steps of each query. Runs by their name."""
-    rows, seen = [], set()
+    rows: list[dict[str, Cell]] = []
+    seen: set[str] = set()
     for name, run in runs.items():
-        rows += [row for cost in run.costs[:-1] if _new(cost.run, seen) for row in [_stage(name, cost)]]
-        rows += _queries(name, run)
+        for cost in run.costs:
+            if _new(cost.run, seen):
+                rows += _queries(name, run, cost) if cost.stage == LOCALIZE else [_stage(name, cost)]
     return Table(
         "runtime",
         "Runtime by step",
@@ -69,22 +71,22 @@ def _stage(name: str, cost: StageCost) -> dict[str, Cell]:
     return {**row, "memory": cost.peak_memory_mb}
 
 
-def _queries(name: str, run: VariantRun) -> Iterator[dict[str, Cell]]:
+def _queries(name: str, run: VariantRun, cost: StageCost) -> Iterator[dict[str, Cell]]:
     count = max(len(run.outcomes), 1)
     steps = list(dict.fromkeys(step for outcome in run.outcomes for step in outcome.cpu_s))
     times = {step: sum(outcome.cpu_s.get(step, 0.0) for outcome in run.outcomes) for step in steps}
     for step, cpu_s in times.items():
         each = cpu_s / count
-        yield {"name": name, "step": f"{LAST_STAGE}: {step}", "cpu_each": each, "images": count, "cpu": cpu_s}
-    total, last = sum(times.values()), run.costs[-1]
+        yield {"name": name, "step": f"{LOCALIZE}: {step}", "cpu_each": each, "images": count, "cpu": cpu_s}
+    total = sum(times.values())
     yield {
         "name": name,
-        "step": f"{LAST_STAGE}: all",
+        "step": f"{LOCALIZE}: all",
         "cpu_each": total / count,
         "images": count,
         "cpu": total,
-        "wall": last.wall_s,
-        "memory": last.peak_memory_mb,
+        "wall": cost.wall_s,
+        "memory": cost.peak_memory_mb,
     }
 
 
@@ -92,14 +94,14 @@ def _storage(name: str, run: VariantRun, seen: set[str]) -> Iterator[dict[str, C
     context = run.context
     assert context is not None
     references = len(context.survey.reference.images)
-    for what, folder in {**context.before, LAST_STAGE: context.folder}.items():
+    for what, folder in {**context.before, LOCALIZE: context.folder}.items():
         if what == "features" or not _new(str(folder), seen):  # a summary alone: the features are in the store
             continue
         size = _bytes(folder)
         if what == "store":
             yield {"name": name, "what": "local features", **_feature_sizes(folder, size)}
         else:
-            images = len(run.outcomes) if what == LAST_STAGE else references
+            images = len(run.outcomes) if what == LOCALIZE else references
             yield {"name": name, "what": what, "images": images, "bytes_each": size / max(images, 1), "bytes": size}
 
 

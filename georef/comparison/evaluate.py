@@ -13,7 +13,7 @@ import numpy as np
 from georef import __version__
 from georef.comparison.accuracy import Row, rows_of, table_of
 from georef.comparison.costs import runtime_table, storage_table
-from georef.comparison.run import Runs, Say, Source, VariantRun, variants_of
+from georef.comparison.run import LOCALIZE, STATIONS, Runs, Say, Source, VariantRun, variants_of
 from georef.comparison.truth import TruthFile, read_truth
 from georef.comparison.variants import TableSection, read_tables
 from georef.evaluation.curves import POSITION_RANGE_M, ROTATION_RANGE_DEG, round_limits
@@ -25,6 +25,7 @@ from georef.project import Project
 from georef.report.evaluation_page import curve_pictures, render_evaluation
 
 JSON, HTML = "evaluation.json", "evaluation.html"
+LAST_STAGES = {"single": LOCALIZE, "stations": STATIONS}
 _RANGES = {
     "position_m": ("position", "m", POSITION_RANGE_M),
     "rotation_deg": ("rotation", "deg", ROTATION_RANGE_DEG),
@@ -82,7 +83,10 @@ def compare(
         source.open(variant)  # a mistake in any variant shows before the first one runs
     file = read_truth(truth, project, epoch, sigmas or TruthSigmas())
     runs = Runs(source, executor, say)
-    results = {name: [runs.run(variant) for variant in listing] for name, listing in listed.items()}
+    results = {
+        section.name: [runs.run(variant, LAST_STAGES[section.poses]) for variant in listed[section.name]]
+        for section in sections
+    }
     rows = {section.name: rows_of(section, results[section.name], file) for section in sections}
     tables = [table_of(section, rows[section.name]) for section in sections]
     once = _each_once(results)
@@ -120,11 +124,11 @@ def _first_of(rows: Sequence[Row]) -> list[Row]:
 
 def _each_once(results: Mapping[str, Sequence[VariantRun]]) -> dict[str, VariantRun]:
     """Runs that differ in their results, each by the name of the table and the variant that had it first."""
-    found: dict[Path, tuple[str, VariantRun]] = {}
+    found: dict[str, tuple[str, VariantRun]] = {}
     for table, runs in results.items():
         for run in runs:
             if run.context is not None:
-                found.setdefault(run.context.folder, (f"{table}: {run.variant.name}", run))
+                found.setdefault(run.costs[-1].run, (f"{table}: {run.variant.name}", run))
     return dict(found.values())
 
 

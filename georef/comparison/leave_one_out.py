@@ -110,9 +110,9 @@ class LeaveOneOut:
 
 def stages_of(choice: Choice) -> tuple[Stage, ...]:
     """What localizes chosen reference images against the others, and the stages that it needs."""
-    needed = tuple(stage for stage in STAGES if stage.name in ("features", "network", "index"))
+    needed = tuple(stage for stage in STAGES if stage.name in ("features", "network", "index", "tracks"))
     run, exist = partial(leave_one_out.run, choice), partial(leave_one_out.outcomes_exist, choice)
-    reads, needs = reference_with_images, ("network", "index")
+    reads, needs = reference_with_images, ("network", "index", "tracks")
     last = Stage(FOLDER, 1, LOCALIZE_KEYS, reads, needs, run, of_reference=True, results_exist=exist)
     return *needed, last
 

@@ -1,4 +1,4 @@
-"""Runs the variants of an evaluation through the ordinary pipeline, as far as localization.
+"""Runs the variants of an evaluation through the ordinary pipeline, as far as localization or stations.
 
 Nothing here reads the truth. Finished stages are kept, an interrupted evaluation goes on where it ended.
 """
@@ -16,14 +16,14 @@ from georef.comparison.variants import AS_CONFIGURED, TableSection, Variant
 from georef.config import Config
 from georef.errors import ConfigError, StageError, WeightsError
 from georef.executor import Executor
-from georef.pipeline import DONE, run_pipeline
+from georef.pipeline import DONE, STAGES, run_pipeline
 from georef.project import Project, open_project
 from georef.stages.base import StageContext
 from georef.stages.localize import read_outcomes
 from georef.stages.survey import load_survey
 from georef.types.results import Outcome
 
-LAST_STAGE = "localize"
+LOCALIZE, STATIONS = "localize", "stations"
 Say = Callable[[str], None]
 logger = logging.getLogger(__name__)
 
@@ -70,7 +70,7 @@ class VariantRun:
 
     variant: Variant
     config: Config | None = None
-    outcomes: tuple[Outcome, ...] = ()
+    outcomes: tuple[Outcome, ...] = ()  # of the last stage
     context: StageContext | None = None  # of the stage `localize`
     costs: tuple[StageCost, ...] = ()
     problem: str = ""
@@ -85,30 +85,32 @@ class Runs:
     say: Say
     done: dict[str, VariantRun] = field(default_factory=dict)
 
-    def run(self, variant: Variant) -> VariantRun:
-        """A component or weights that are missing are the result of their variant; what is wrong with the project
-        itself is raised as GeorefError."""
+    def run(self, variant: Variant, last: str = LOCALIZE) -> VariantRun:
+        """The variant up to a stage. A component or weights that are missing are the result of their variant; what is
+        wrong with the project itself is raised as GeorefError."""
         project, epoch = self.source.open(variant)
-        key = json.dumps([project.config.model_dump(), project.file.model_dump()], sort_keys=True, default=str)
+        said = [last, project.config.model_dump(), project.file.model_dump()]
+        key = json.dumps(said, sort_keys=True, default=str)
         if key not in self.done:
             self.say(f"{variant.name}:")
-            self.done[key] = self._run(variant, project, epoch)
+            self.done[key] = self._run(variant, project, epoch, last)
         known = self.done[key]
         return VariantRun(variant, known.config, known.outcomes, known.context, known.costs, known.problem)
 
-    def _run(self, variant: Variant, project: Project, epoch: str) -> VariantRun:
-        costs, context = [], None
+    def _run(self, variant: Variant, project: Project, epoch: str, last: str) -> VariantRun:
+        costs, contexts = [], {}
+        stages = STAGES[: [stage.name for stage in STAGES].index(last) + 1]
         try:
-            for result in run_pipeline(project, epoch, self.executor, LAST_STAGE):
+            for result in run_pipeline(project, epoch, self.executor, stages=stages):
                 kept = "kept" if result.reused else f"{result.timing['cpu_s']:.0f} CPU-s"
                 self.say(f"  {result.stage:<10} {result.summary.line}  [{kept}]")
-                context = result.context
-                costs.append(_cost(context.folder / DONE))
+                contexts[result.stage] = result.context
+                costs.append(_cost(result.context.folder / DONE))
         except (ConfigError, StageError, WeightsError) as error:
             logger.warning("variant '%s' was not run: %s", variant.name, error)
             return VariantRun(variant, project.config, problem=str(error).splitlines()[0])
-        assert context is not None
-        outcomes = tuple(read_outcomes(context.folder, context.survey.epoch))
+        context, final = contexts[LOCALIZE], contexts.get(STATIONS, contexts[LOCALIZE])
+        outcomes = tuple(read_outcomes(final.folder, context.survey.epoch))
         return VariantRun(variant, project.config, outcomes, context, tuple(costs))
 
 

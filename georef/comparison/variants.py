@@ -36,6 +36,7 @@ class TableSection(Section):
     caption: str = ""
     rows: Literal["variants", "cameras", "reference-epochs"] = "variants"
     columns: Literal["accuracy", "retrieval"] = "accuracy"
+    poses: Literal["single", "stations"] = "single"  # of each image alone, or as [stations] poses them together
     variants: tuple[Variant, ...] = Field(default=(Variant(name=AS_CONFIGURED),), min_length=1)
 
     @field_validator("variants")

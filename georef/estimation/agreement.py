@@ -89,6 +89,16 @@ def contradiction(matched: Matched, query: QueryImage, pose: Rigid3, model: Loca
     return _worst(of_epochs) or _worst([_against_others(matched, int(v), model) for v in np.flatnonzero(suspect)])
 
 
+def contradicting_epoch(matched: Matched, query: QueryImage, pose: Rigid3) -> Contradiction | None:
+    """The epoch that contradicts the others most, where one does: each is judged, whatever its matches look like.
+
+    For points that were verified before the query was known, which each epoch may have of its own.
+    """
+    epochs = np.array(matched.epochs)
+    names = sorted(set(matched.epochs))
+    return _worst([_epoch_against_others(matched, epochs == name, query, pose) for name in names if len(names) > 1])
+
+
 def suspects(matched: Matched, model: LocalModel) -> NDArray[np.bool_]:
     """Whether each reference's matches are farther from the model's points than they should be."""
     out = np.zeros(len(matched.references), bool)

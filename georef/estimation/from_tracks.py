@@ -13,6 +13,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from georef.estimation.agreement import Matched, contradicting_epoch
 from georef.estimation.candidates import overlap
 from georef.estimation.global_model import global_model, one_point_each
 from georef.estimation.guided import GuidedOptions
@@ -20,9 +21,10 @@ from georef.estimation.local_model import LocalModel
 from georef.estimation.pnp import EstimatedPose, refine_pose
 from georef.estimation.query import Query, consensus, outcome_of
 from georef.estimation.query_centred import first_pose
-from georef.estimation.seen_tracks import SeenTracks, as_seen_from, associate, local_model_of
+from georef.estimation.seen_tracks import SeenTracks, as_seen_from, associate, local_model_of, without_views
 from georef.features.nearest import MutualNearest
 from georef.geometry.rigid import Rigid3
+from georef.types.features import Matches
 from georef.types.results import Outcome, Rejected, RejectReason
 
 _VOTE_RATIO = 0.95
@@ -49,7 +51,39 @@ def from_tracks(query: Query, ranked: NDArray[np.int64]) -> Outcome:
         estimate = refined
         if query.image.camera.estimate:
             query.use(estimate.camera)
+    return _agreeing(query, estimate, model, names)
+
+
+def _agreeing(query: Query, estimate: EstimatedPose, model: LocalModel, names: list[int]) -> Outcome:
+    """The outcome without the epochs that contradict the others."""
+    for _ in range(len({query.reference.images[i].epoch for i in names}) - 1):
+        with query.timed("agreement"):
+            matched = _matched(query, model.take(estimate.inliers), names)
+            odd = contradicting_epoch(matched, query.observed, estimate.world_from_cam)
+        if odd is None:
+            break
+        query.notes.append(odd.describe(query.reference.images[names[odd.views[0]]].image_id))
+        model, names = without_views(model, names, odd.views, query.reference.views)
+        with query.timed("pose"):
+            refined = refine_pose(estimate.world_from_cam, query.observed, model, query.reference.errors(names))
+        if refined is None:
+            return outcome_of(query, None, model, names)
+        estimate = refined
     return outcome_of(query, estimate, model, names)
+
+
+def _matched(query: Query, model: LocalModel, names: Sequence[int]) -> Matched:
+    """What the references have in common with the query: the observations of the tracks that it sees."""
+    obs = model.observations
+    pairs = np.column_stack([model.keypoint[obs.point], obs.keypoint]).astype(np.int32)
+    here = [obs.view == view for view in range(len(names))]
+    return Matched(
+        [query.reference.posed(i) for i in names],
+        [Matches(pairs[rows], np.ones(int(rows.sum()), np.float32)) for rows in here],
+        query.reference.errors(names),
+        [query.reference.images[i].epoch for i in names],
+        query.reference.noise.keypoint_sigma,
+    )
 
 
 def _found(query: Query, estimate: EstimatedPose, chosen: Sequence[int]) -> tuple[LocalModel, list[int]]:

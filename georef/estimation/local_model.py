@@ -79,7 +79,7 @@ def triangulate_consistent(
         obs = obs.take((np.bincount(obs.point, minlength=count)[obs.point] >= 2) & (worst[obs.point] <= gate))
         solved = triangulate(views, obs.point, obs.view, obs.pixel, obs.sigma_px, count)
     model = LocalModel(keypoint, solved.points, solved.cov, views, obs)
-    return model.take(_well_determined(model))
+    return model.take(well_determined(model))
 
 
 def _gather(
@@ -96,7 +96,7 @@ def _gather(
     return keypoint, Observations(point, view, pixel, keypoint_sigma * scale, pairs[:, 1])
 
 
-def _well_determined(model: LocalModel) -> NDArray[np.bool_]:
+def well_determined(model: LocalModel) -> NDArray[np.bool_]:
     """Points whose distance from the references is known to a few per cent."""
     finite = np.asarray(np.isfinite(model.points).all(axis=1) & np.isfinite(model.cov).all(axis=(1, 2)))
     obs = model.observations

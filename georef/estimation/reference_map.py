@@ -9,8 +9,10 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from georef.estimation.guided import PosedFeatures
+from georef.estimation.left_out import remaining
 from georef.estimation.reference_errors import ReferenceErrors
 from georef.geometry.angles import heading_of
 from georef.geometry.projection import Views
@@ -57,15 +59,22 @@ class ReferenceMap:
     def without(self, left_out: Collection[str]) -> ReferenceMap:
         """The map without some images (ids), the others in their order; features read so far are shared.
 
-        A precomputed map is left behind: its points rest on all images.
+        Tracks are intersected again without the observations of the images that are left out.
         """
         keep = [i for i, image in enumerate(self.images) if image.image_id not in left_out]
         part = copy(self)
         part.images = tuple(self.images[i] for i in keep)
         part.poses = [self.poses[i] for i in keep]
         part.positions, part.headings_rad = self.positions[keep], self.headings_rad[keep]
-        part._pairs, part._structures, part._read_structure = OrderedDict(), OrderedDict(), None
+        part._pairs, part._structures = OrderedDict(), OrderedDict()
+        if self._read_structure is not None:
+            place = np.full(len(self), -1, np.int64)
+            place[keep] = np.arange(len(keep))
+            part._read_structure = lambda index: self._remaining(keep[index], place)
         return part
+
+    def _remaining(self, index: int, place: NDArray[np.int64]) -> ImageStructure:
+        return remaining(self.structure(index), index, place, self.posed, self.pose_cov, self.noise)
 
     def head(self, index: int, count: int) -> Features:
         """The best `count` features of a reference image."""

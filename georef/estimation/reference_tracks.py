@@ -57,7 +57,7 @@ def verified_tracks(
     parts = []
     for _ in range(_ROUNDS):
         label = joined(links.ends[free[links.ends].all(axis=1)], links.view)
-        tracks = _consistent(views, links.observations(label, noise), noise, np.array(pose_covs))
+        tracks = consistent_tracks(views, links.observations(label, noise), noise, np.array(pose_covs))
         parts.append(tracks)
         used = links.start[tracks.observations.view] + tracks.observations.keypoint
         free[used] = False
@@ -82,7 +82,7 @@ def block_tracks(
     local = {(place[a], place[b]): found for (a, b), found in matches.items()}
     tracks = verified_tracks([images[i] for i in members], local, noise, [pose_covs[i] for i in members])
     named = np.array(members, dtype=np.int64)
-    return {image: _structure(place[image], named, tracks) for image in block}
+    return {image: structure_of(place[image], named, tracks) for image in block}
 
 
 def joined(ends: NDArray[np.int64], view: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -146,8 +146,11 @@ def _links(images: Sequence[PosedFeatures], matches: Mapping[Pair, Matches]) -> 
     )
 
 
-def _consistent(views: Views, observations: Observations, noise: ReferenceNoise, pose_covs: Array) -> Tracks:
-    """Points from the observations that agree within their noise and what the errors of the poses do to them."""
+def consistent_tracks(views: Views, observations: Observations, noise: ReferenceNoise, pose_covs: Array) -> Tracks:
+    """Points from the observations that agree within their noise and what the errors of the poses do to them.
+
+    observations: with the sigmas of their keypoints alone; pose_covs: (V, 6, 6) of the views.
+    """
     count = int(observations.point.max()) + 1 if len(observations) else 0
     rough = triangulate(
         views, observations.point, observations.view, observations.pixel, observations.sigma_px, count
@@ -189,8 +192,8 @@ def _concatenated(parts: Sequence[Tracks]) -> Tracks:
     )
 
 
-def _structure(own: int, members: NDArray[np.int64], tracks: Tracks) -> ImageStructure:
-    """The tracks that one of the images sees, in the order of its keypoints."""
+def structure_of(own: int, members: NDArray[np.int64], tracks: Tracks) -> ImageStructure:
+    """The tracks that one of the images (its view) sees, in the order of its keypoints; members name the views."""
     obs = tracks.observations
     here = np.flatnonzero(obs.view == own)
     here = here[np.argsort(obs.keypoint[here], kind="stable")]

@@ -6,7 +6,7 @@ the disc descriptors decide, those of the references that see the point most lik
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -16,13 +16,14 @@ from scipy.stats import chi2
 
 from georef.estimation.first_pose import QueryImage
 from georef.estimation.guided import GuidedOptions, PosedFeatures, mutual_best
-from georef.estimation.local_model import LocalModel, triangulate_consistent
+from georef.estimation.local_model import LocalModel, well_determined
 from georef.estimation.pnp import EstimatedPose
 from georef.estimation.tracks import nearest_ray_angles
 from georef.features.nearest import unit_rows
 from georef.geometry.camera import Camera
 from georef.geometry.projection import Views, linearize
 from georef.geometry.rigid import Array, Rigid3
+from georef.geometry.triangulation import triangulate
 from georef.types.results import ReferenceNoise
 from georef.types.scene import ImageStructure, Observations
 
@@ -30,7 +31,6 @@ _LARGEST_ANGLE_DEG = 60.0
 _LARGEST_SCALE_RATIO = 3.0
 _LOOKS = 3  # observations of a track whose descriptors are compared, the most similar in direction and scale
 _ANGLE_OF_DOUBLE_RAD = np.radians(30.0)  # an angle between rays that makes as unlike as twice the scale
-_AGREEMENT = 3.5  # sigmas of a keypoint
 _GATE = float(chi2.ppf(0.999, 2))
 _LARGEST_RADIUS_SHARE = 0.1  # of the longer image side: a first pose less sure than that is looked around no farther
 
@@ -128,7 +128,8 @@ def as_seen_from(model: LocalModel, world_from_cam: Rigid3, noise: ReferenceNois
     """The same points, intersected again: what sees them from another side than the query counts less.
 
     From another side a keypoint sits on a slightly different spot of the same thing; the spot that the query shows is
-    wanted. The observations come weighted for the angle to the nearest other ray of their point.
+    wanted. The observations come weighted for the angle to the nearest other ray of their point. They were verified
+    with the errors of the reference poses, and none is dropped: what agrees best by chance would pass for certain.
     """
     obs, centres = model.observations, model.views.centres
     to_query = model.points[obs.point] - world_from_cam.translation
@@ -137,7 +138,28 @@ def as_seen_from(model: LocalModel, world_from_cam: Rigid3, noise: ReferenceNois
     cosine = np.einsum("ni,ni->n", to_query, to_view) / np.maximum(length, 1e-12)
     own = obs.sigma_px / noise.widening(nearest_ray_angles(model.points, obs, centres))
     widened = replace(obs, sigma_px=own * noise.widening(np.arccos(np.clip(cosine, -1.0, 1.0))))
-    return triangulate_consistent(model.views, model.keypoint, widened, _AGREEMENT)
+    return _intersected(replace(model, observations=widened))
+
+
+def without_views(
+    model: LocalModel, names: Sequence[int], dropped: Collection[int], views_of: Callable[[Sequence[int]], Views]
+) -> tuple[LocalModel, list[int]]:
+    """The points that are left without some of a model's views, and the references (by place) that its views are."""
+    obs = model.observations
+    kept = obs.take(~np.isin(obs.view, list(dropped)))
+    chosen = [view for view in range(len(names)) if view not in dropped]
+    place = np.full(len(names), -1, np.int64)
+    place[chosen] = np.arange(len(chosen))
+    left = [names[view] for view in chosen]
+    return _intersected(replace(model, views=views_of(left), observations=replace(kept, view=place[kept.view]))), left
+
+
+def _intersected(model: LocalModel) -> LocalModel:
+    """The points of a model intersected again from its observations."""
+    obs = model.observations
+    solved = triangulate(model.views, obs.point, obs.view, obs.pixel, obs.sigma_px, len(model))
+    again = replace(model, points=solved.points, cov=solved.cov)
+    return again.take(well_determined(again))
 
 
 def _rows(index: int, structure: ImageStructure) -> NDArray[np.int64]:

@@ -2,6 +2,7 @@
 
 reference_eo.csv  reference/   or, for several reference epochs,  <name>_eo.csv  <name>/
 <epoch>_gnss.csv  <epoch>/     camera.csv, or cameras_<epoch>.csv for an epoch of its own cameras
+rig.csv, or rig_<epoch>.csv    how the cameras of an epoch are mounted
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ from georef.errors import InputError
 from georef.project import REFERENCE
 
 EO_SUFFIX, GNSS_SUFFIX, CAMERAS = "_eo.csv", "_gnss.csv", "camera.csv"
+RIG = "rig.csv"
 ORIENTATION = REFERENCE + EO_SUFFIX
 
 
@@ -30,7 +32,13 @@ class Found:
 
     def cameras(self, epoch: str) -> str | None:
         """The camera table of an epoch; None: there is none."""
-        usual = (f"cameras_{epoch}.csv", f"camera_{epoch}.csv", CAMERAS)
+        return self._first(f"cameras_{epoch}.csv", f"camera_{epoch}.csv", CAMERAS)
+
+    def rig(self, epoch: str) -> str | None:
+        """The table of the rig of an epoch; None: there is none."""
+        return self._first(f"rig_{epoch}.csv", RIG)
+
+    def _first(self, *usual: str) -> str | None:
         return next((name for name in usual if (self.data / name).is_file()), None)
 
 

@@ -221,7 +221,7 @@ def _project_text(found: Found, definition: CrsDefinition, origin: list[float], 
     ]
     for epoch in found.epochs:
         lines += ["", f"[epochs.{_key(epoch)}]", f"images = {_quoted(epoch)}", _cameras_text(epoch, facts)]
-        lines += [f"gnss = {_quoted(epoch + GNSS_SUFFIX)}", *table]
+        lines += [f"gnss = {_quoted(epoch + GNSS_SUFFIX)}", *_rig_text(epoch, facts), *table]
     return "\n".join([*lines, *_points_text(found.data, found.epochs, facts, answers, table)]) + "\n"
 
 
@@ -242,6 +242,18 @@ def _cameras_text(epoch: str, facts: _Facts) -> str:
         return f"cameras = {_quoted(cameras)}"
     facts.said.append(f"epoch {epoch}: no table of cameras, focal length and k1 are to be estimated")
     return 'intrinsics = "estimate"  # no table of cameras was found'
+
+
+def _rig_text(epoch: str, facts: _Facts) -> list[str]:
+    """The line that names the rig of an epoch whose table of positions says what was exposed together."""
+    rig, positions = facts.found.rig(epoch), facts.tables[epoch + GNSS_SUFFIX]
+    if rig is None:
+        return []
+    if not positions.has("station"):
+        facts.said.append(f"epoch {epoch}: {rig} is left out, its positions have no column 'station'")
+        return []
+    facts.said.append(f"epoch {epoch}: a rig, {rig}")
+    return [f"rig = {_quoted(rig)}"]
 
 
 def _reference_text(epoch: str, facts: _Facts, table: list[str]) -> list[str]:

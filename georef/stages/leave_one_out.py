@@ -22,10 +22,7 @@ from georef.types.campaign import Image, PosePrior
 from georef.types.results import Outcome
 
 NAME = "leave-one-out"
-_REST_ON_ALL = (
-    "global-model",
-    "tracks",
-)  # methods whose points were made from all references, the left out one included
+_REST_ON_ALL = ("global-model",)  # methods whose points were made from all references, the left out one included
 
 
 @dataclass(frozen=True)

@@ -43,7 +43,7 @@ class LocalizeTask:
     failed: dict[str, tuple[str, str]]
     index_folder: Path | None  # of the vector database, where the ranking needs one
     map_folder: Path | None  # of the precomputed map, where the method needs one
-    upright: frozenset[str] = frozenset()  # new images that are known to stand upright
+    upright: frozenset[Path] = frozenset()  # pictures that are known to stand upright
 
     @cached_property
     def similar(self) -> SimilarImages | None:
@@ -92,7 +92,7 @@ class LocalizeTask:
                 self.config.localize,
                 self.config.matching.max_keypoints,
                 similar,
-                self._picture(image),
+                self._picture(image, index),
             )
         except UnreadableImage as error:
             return Rejected(image.image_id, RejectReason.UNREADABLE, error.problem)
@@ -100,11 +100,11 @@ class LocalizeTask:
             reason, detail = internal_failure(error, f"localization of {image.image_id}")
             return Rejected(image.image_id, RejectReason(reason), detail)
 
-    def _picture(self, image: Image) -> TurnableImage | None:
+    def _picture(self, image: Image, index: SimilarImages | None) -> TurnableImage | None:
         """None for an image that cannot lie on its side, and where turned ones are not to be tried."""
-        if not self.config.localize.try_turned or image.image_id in self.upright:
+        if not self.config.localize.try_turned or image.path in self.upright:
             return None
-        return TurnableImage(image, self.store_folder, self.config.features, lambda: self.extractor, self.similar)
+        return TurnableImage(image, self.store_folder, self.config.features, lambda: self.extractor, index)
 
     @cached_property
     def extractor(self) -> Extractor:
@@ -133,8 +133,7 @@ def make_task(context: StageContext) -> LocalizeTask:
     campaign, folders = Campaign(context.survey.reference.epoch, usable), context.before
     noise, failed = read_noise(folders["network"])[0], failed_images(folders["features"])
     index, precomputed = folders.get("index"), folders.get("tracks", folders.get("global-map"))
-    cut = {cutout.path for cutout in context.survey.cutouts}  # of panoramas, which stand upright
-    upright = frozenset(image.image_id for image in context.survey.epoch.images if image.path in cut)
+    upright = frozenset(cutout.path for cutout in context.survey.cutouts)  # of panoramas
     return LocalizeTask(campaign, noise, folders["store"], context.config, failed, index, precomputed, upright)
 
 

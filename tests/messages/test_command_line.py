@@ -205,6 +205,35 @@ def test_init_writes_a_project_that_opens(tiny_tables: Path, capsys: pytest.Capt
     assert called("status", tiny_tables / "made", "--data", tiny_tables) == 0
 
 
+def _with_rig(tables: Path, stations: tuple[str, str, str]) -> None:
+    """A rig of two cameras; the tiny epoch's three images belong to stations."""
+    one, two = ("camera,x,y,z,yaw,pitch,roll,sigma_m,sigma_deg", "cam,0,0,0,0,0,0,0,0")
+    (tables / "rig.csv").write_text(f"{one}\n{two}\nother,1,0,0,90,0,0,0.001,0.01\n", encoding="utf-8")
+    path = tables / f"{EPOCH}_gnss.csv"
+    lines = path.read_text(encoding="utf-8").splitlines()
+    head = next(i for i, line in enumerate(lines) if line[0] != "#")
+    lines[head] += ",station"
+    lines[head + 1 :] = [f"{line},{name}" for line, name in zip(lines[head + 1 :], stations, strict=True)]
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+def test_init_and_doctor_know_rigs(tiny_tables: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    _with_rig(tiny_tables, ("0", "1", ""))
+    assert init(tiny_tables, "--check-kind", "absolute") == 0
+    assert f"epoch {EPOCH}: a rig, rig.csv" in capsys.readouterr().out
+    assert called("doctor", tiny_tables / "made", "--data", tiny_tables) == 0
+    text = capsys.readouterr().out
+    assert f"epoch {EPOCH}: 2 exposures of a rig (2 of 1 images)" in text
+    assert "No exposure has two images" in text
+
+
+def test_init_leaves_out_a_rig_without_stations(tiny_tables: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tiny_tables / "rig.csv").write_text("camera\n", encoding="utf-8")
+    assert init(tiny_tables, "--check-kind", "absolute") == 0
+    assert "rig.csv is left out, its positions have no column 'station'" in capsys.readouterr().out
+    assert "rig =" not in (tiny_tables / "made" / "project.toml").read_text(encoding="utf-8")
+
+
 def test_init_overwrites_nothing(tiny_tables: Path, capsys: pytest.CaptureFixture[str]) -> None:
     before = (tiny_tables / "project.toml").read_bytes()
     assert called("init", tiny_tables, "--data", tiny_tables, "--check-kind", "absolute") == 1

@@ -58,6 +58,17 @@ variants = [
 ]
 """
 
+TOGETHER = """
+[[tables]]
+name = "stations"
+title = "Together"
+poses = "stations"
+variants = [
+  { name = "single image", set = { stations.together = "none" } },
+  { name = "sequence", set = { stations.together = "sequence" } },
+]
+"""
+
 
 @pytest.fixture
 def tables(tmp_path: Path) -> Path:
@@ -127,6 +138,24 @@ def test_costs_are_those_of_the_steps_and_the_files(copied: Callable[..., Bench]
     files = list(bench.open().feature_folder.rglob("*.safetensors"))
     assert (features["images"], features["bytes"]) == (len(files), sum(f.stat().st_size for f in files))
     assert features["keypoints"] == 700
+
+
+def test_images_posed_together_stand_beside_single_ones(copied: Callable[..., Bench], tmp_path: Path) -> None:
+    path = tmp_path / "together.toml"
+    path.write_text(TOGETHER, encoding="utf-8")
+    comparison = compared(copied(), path)
+    runs = {row.name: row.run for row in comparison.rows["stations"]}
+    poses = {
+        name: [o.world_from_cam.matrix() for o in run.outcomes if isinstance(o, Localized)]
+        for name, run in runs.items()
+    }
+    assert len(poses["single image"]) == len(poses["sequence"]) == 3
+    moved = np.abs(np.array(poses["single image"]) - np.array(poses["sequence"])).max()
+    assert 1e-6 < moved < 0.02
+    assert [run.costs[-1].stage for run in runs.values()] == ["localize", "stations"]
+    runtime = next(t for t in comparison.tables if t.name == "runtime").rows
+    assert [row["name"] for row in runtime if row["step"] == "localize: all"] == ["stations: single image"]
+    assert [row["name"] for row in runtime if row["step"] == "stations"] == ["stations: sequence"]
 
 
 def test_the_pipeline_runs_without_the_truth(
@@ -244,7 +273,7 @@ def test_workers_make_the_same_map(copied: Callable[..., Bench], tmp_path: Path)
 def test_the_default_tables_fit_the_configuration(finished: Bench) -> None:
     source = Source(finished.data, output=finished.output)
     listed = read_tables(None, [])
-    assert [table.name for table in listed] == ["cameras", "epochs", "features", "retrieval", "models"]
+    assert [table.name for table in listed] == ["cameras", "epochs", "features", "retrieval", "models", "stations"]
     for variant in (v for table in listed for v in table.variants):
         source.open(variant)
     boxes = [source.open(v)[0].config.candidates for v in listed[3].variants]

@@ -31,9 +31,10 @@ def image(name: str, epoch: str = "2023", station: str | None = None) -> Image:
     return Image(name, Path(name), camera, epoch, world_from_cam=Rigid3.identity(), station=station)
 
 
-def left_out(bench: Bench, choice: Choice, said: list[str] | None = None) -> LeaveOneOut:
+def left_out(bench: Bench, choice: Choice, said: list[str] | None = None, *settings: str) -> LeaveOneOut:
     say = (said if said is not None else []).append
-    return leave_out(Source(bench.data, output=bench.output), choice, executor=Executor(), say=say)
+    source = Source(bench.data, output=bench.output, settings=settings)
+    return leave_out(source, choice, executor=Executor(), say=say)
 
 
 def test_an_image_is_left_out_with_its_station_and_no_other() -> None:
@@ -89,6 +90,21 @@ def test_poses_agree_with_the_given_ones_as_their_covariances_say(copied: Callab
     for outcome in sorted((bench.output / "work" / "reference" / "leave-one-out").rglob("*.npz")):
         with np.load(outcome) as stored_item:
             header = json.loads(stored_item["header_json"].tobytes())
+        assert header["image_id"] not in [*header["references"], *header["candidates"]]
+
+
+def test_tracks_are_looked_up_without_the_image(copied: Callable[..., Bench]) -> None:
+    bench, said = copied(), []
+    found = left_out(bench, Choice(count=4), said, "localize.method=tracks")
+    assert any(line.startswith("  tracks ") for line in said), said
+    row = found.table.to_dict()["rows"][0]
+    assert row["localized"]["value"] == 100.0
+    assert 0.0005 < row["median_position"]["value"] < 0.02
+    assert 0.1 < row["nees_per_dof"]["value"] < 3.0
+    for path in sorted((bench.output / "work" / "reference" / "leave-one-out").rglob("*.npz")):
+        with np.load(path) as stored:
+            header = json.loads(stored["header_json"].tobytes())
+        assert len(header["references"]) >= 2
         assert header["image_id"] not in [*header["references"], *header["candidates"]]
 
 
