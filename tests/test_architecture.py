@@ -32,7 +32,7 @@ ALLOWED: dict[str, set[str]] = {
     # takes frozen sections of the configuration, and a Progress to show; opens no file
     "estimation": {"errors", "config", "executor", "geometry", "types", "features", "evaluation"},
     "capture": {"errors", "config", "geometry", "types", "crs", "io"},
-    "simulate": {"errors", "replacing", "geometry", "types", "crs", "io", "project"},
+    "simulate": {"errors", "replacing", "geometry", "types", "crs", "io", "project", "estimation"},
     "report": {"errors", "geometry", "types", "crs", "evaluation"},
     "viewer": {"errors", "config", "replacing", "pictures", "geometry", "types", "features", "report"},
     "stages": {
@@ -229,7 +229,8 @@ def test_the_command_line_starts_light() -> None:
 
 
 def test_the_simulated_truth_is_out_of_the_pipeline_s_reach() -> None:
-    """Only the verb `demo` knows the simulation; the stages that it runs are those of any project."""
+    """Only the verb `demo` and the benchmark of the adjustment know the simulation; the stages that the verb runs are
+    those of any project."""
     outside = [path for path in SOURCES if room(path) != "simulate"]
     importers = [path for path in outside if "simulate" in {name for _, name in imported_rooms(path)}]
-    assert importers == [PACKAGE / "stages" / "demo.py"]
+    assert importers == [PACKAGE / "benchmarks" / "adjustment_problem.py", PACKAGE / "stages" / "demo.py"]

@@ -10,6 +10,7 @@ import pytest
 from georef.errors import GeorefError
 from georef.estimation.adjustment.adjust_block import AdjustedBlock, BlockOptions, adjust_block, quality
 from georef.estimation.adjustment.block import Block, PointPriors, PosePriors, PositionPriors
+from georef.estimation.adjustment.coherent import CoherentBlock, CoherentSearch, without_agreeing
 from georef.estimation.adjustment.constraint_terms import POSITION_PRIORS
 from georef.estimation.adjustment.eliminate import IMAGE_OBSERVATIONS, normal_equations
 from georef.estimation.adjustment.shift_system import ShiftSystem, pose_shifts
@@ -133,3 +134,17 @@ def test_shifts_of_poses_against_adding_them_as_unknowns(clean: tuple[RigBlock, 
     (with_planted,), _, _ = after.estimate(design)
     assert np.allclose(with_planted - shift, planted, atol=2e-3)
     assert shift @ np.linalg.solve(cov, shift) < 16.3
+
+
+def test_a_right_pose_in_a_named_block_is_taken_back(clean: tuple[RigBlock, AdjustedBlock]) -> None:
+    """A block that names a wrong pose and a right one keeps the wrong one."""
+    block, state = clean[1].block, clean[1].solution.state
+    shift = np.array([0.5, 0.0, 0.2])
+    poses = block.pose_priors.world_from_cam
+    moved = poses.translation.copy()
+    moved[0] += shift
+    spoilt = replace(block, pose_priors=replace(block.pose_priors, world_from_cam=replace(poses, translation=moved)))
+    lacking = replace(block, pose_priors=block.pose_priors.take(np.arange(len(poses)) > 1))
+    named = CoherentBlock(("s0", "s1"), np.array([0, 1]), shift, 1e-4 * np.eye(3), 100.0)
+    search = without_agreeing(CoherentSearch((named,), False), spoilt, state, quality(lacking, state).cofactors, 0.999)
+    assert [wrong.rows.tolist() for wrong in search.blocks] == [[0]]

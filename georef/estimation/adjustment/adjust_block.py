@@ -16,7 +16,7 @@ from georef.estimation.adjustment.block import KINDS_OF_POINT, Block, State
 from georef.estimation.adjustment.block_cholesky import SingularMatrix
 from georef.estimation.adjustment.block_gates import RejectedConstraint, without_contradictions
 from georef.estimation.adjustment.cofactors import Cofactors, cofactors
-from georef.estimation.adjustment.coherent import CoherentBlock, CoherentSearch, coherent_blocks
+from georef.estimation.adjustment.coherent import CoherentBlock, CoherentSearch, coherent_blocks, without_agreeing
 from georef.estimation.adjustment.components import Component
 from georef.estimation.adjustment.constraint_terms import DISTANCES, POSE_PRIORS, POSITION_PRIORS, RELATIVE_POSES
 from georef.estimation.adjustment.datum import explain_singular
@@ -91,8 +91,10 @@ def adjust_block(block: Block, options: BlockOptions) -> AdjustedBlock:
     block, _ = _gate_images(block, state, quality(block, state), gross)
     search = _coherent(block, state, options)
     if search.blocks:
+        lacking = _without_rows(block, search)
+        state = solve_block(lacking, losses=options.losses, options=options.solver, start=state).state
+        search = without_agreeing(search, block, state, quality(lacking, state).cofactors, options.gate_probability)
         block = _without_rows(block, search)
-        state = solve_block(block, losses=options.losses, options=options.solver, start=state).state
     block, rejected = without_contradictions(block, quality(block, state).constraints, gross)
     solution = solve_block(block, options=options.solver, start=state)
     block, solution, scale = _rescaled(block, solution, scale, options)

@@ -7,14 +7,17 @@ together, so that an overlap or a good piece inside a run comes out right.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
-from georef.estimation.adjustment.block import Block, Indices
+from georef.estimation.adjustment.block import Block, Indices, State
+from georef.estimation.adjustment.cofactors import Cofactors
+from georef.estimation.adjustment.constraint_terms import POSE_PRIORS, constraint_terms
+from georef.estimation.adjustment.group_tests import fitted_cofactor
 from georef.estimation.adjustment.shift_system import ShiftSystem
 from georef.geometry.rigid import Array
 
@@ -66,6 +69,37 @@ def coherent_blocks(block: Block, system: ShiftSystem, *, reference_m: float = 0
         for k, piece in enumerate(pieces)
     ]
     return CoherentSearch(tuple(blocks), _undecidable(system, pieces, shifts, cov, limit))
+
+
+def without_agreeing(
+    search: CoherentSearch, block: Block, state: State, found: Cofactors, probability: float
+) -> CoherentSearch:
+    """The search without poses that agree with the rest after all, such as one right pose at the station where a
+    stretch ends: those that pass their own test, and better so than with the shift of their block taken off.
+
+    block has all poses, state and found (its cofactors) are those of the adjustment that lacks the named ones.
+    """
+    blocks = []
+    for wrong in search.blocks:
+        given, priors = _deleted_statistics(block, state, found, wrong, 0.0), len(wrong.rows)
+        corrected = _deleted_statistics(block, state, found, wrong, 1.0)
+        stays = (given > chi2.ppf(probability, 6)) | (given > corrected)
+        if stays.sum() < priors:
+            rows = wrong.rows[stays]
+            stations = np.unique(block.station[block.pose_priors.image[rows]])
+            wrong = replace(wrong, rows=rows, station_ids=tuple(block.station_ids[i] for i in stations))
+        blocks += [wrong] if len(wrong.rows) else []
+    return CoherentSearch(tuple(blocks), search.undecidable)
+
+
+def _deleted_statistics(block: Block, state: State, found: Cofactors, wrong: CoherentBlock, share: float) -> Array:
+    """r' (S + A Q A')^-1 r (k,) of poses that the adjustment lacks, this share of their shift taken off."""
+    poses = block.pose_priors.take(np.isin(np.arange(len(block.pose_priors)), wrong.rows))
+    back = replace(poses.world_from_cam, translation=poses.world_from_cam.translation - share * wrong.shift_m)
+    only = replace(block, pose_priors=replace(poses, world_from_cam=back))
+    (term,) = (t for t in constraint_terms(only, state, found.layout) if t.name == POSE_PRIORS)
+    cov = np.eye(6) + fitted_cofactor(term, found)
+    return np.einsum("ki,ki->k", term.residual, np.linalg.solve(cov, term.residual[:, :, None])[:, :, 0])
 
 
 def _design(runs: list[tuple[int, int]], count: int) -> Array:

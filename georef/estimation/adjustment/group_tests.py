@@ -160,15 +160,21 @@ def _by_kind(whole: TermTests, kind: Indices, names: tuple[str, ...]) -> list[Te
 
 
 def _term_tests(term: Term, found: Cofactors, references: ReferencePart | None) -> TermTests:
-    fitted = np.zeros((*term.residual.shape, term.residual.shape[1]))
     weighted = np.zeros(term.residual.shape, bool)
     for first, by in term.columns:
         weighted |= np.any(by != 0.0, axis=2) & (first >= 0)[:, None]
+    shared = references.of_rows(term.columns, term.residual.shape[1]) if references and term.name in MEASURED else 0.0
+    return TermTests.of(term.name, term.row, term.residual, fitted_cofactor(term, found), weighted, shared)
+
+
+def fitted_cofactor(term: Term, found: Cofactors) -> Array:
+    """A Q A' (K, m, m), whitened, of each constraint."""
+    fitted = np.zeros((*term.residual.shape, term.residual.shape[1]))
+    for first, by in term.columns:
         for other, other_by in term.columns:
             between = found.between(first, by.shape[2], other, other_by.shape[2])
             fitted += by @ between @ np.swapaxes(other_by, 1, 2)
-    shared = references.of_rows(term.columns, term.residual.shape[1]) if references and term.name in MEASURED else 0.0
-    return TermTests.of(term.name, term.row, term.residual, fitted, weighted, shared)
+    return fitted
 
 
 def group_statistics(residual: Array, cofactor: Array) -> tuple[Array, NDArray[np.int64]]:

@@ -13,8 +13,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from georef.estimation.adjustment.batches import BATCH
 from georef.estimation.adjustment.kernels import kernel
-from georef.estimation.adjustment.kernels_points import BATCH, keep, linearize, point_normals, share, sum_stations
+from georef.estimation.adjustment.kernels_points import keep, linearize, point_normals, share, sum_stations
 from georef.geometry.rigid import Array
 
 RANK_TOLERANCE = 0.05
