@@ -59,7 +59,7 @@ def test_the_offset_of_the_positions_is_found_in_two_ways(adjusted: Path) -> Non
 def test_splits_agree_with_an_adjustment(adjusted: Path) -> None:
     hold_out = json.loads((adjusted / "report.json").read_text(encoding="utf-8"))["hold_out"]
     assert len(hold_out["splits"]) == 6
-    assert hold_out["first_split_adjusted_differs_m"] < 1e-3
+    assert hold_out["first_split_adjusted_differs_m"] < 3e-3
     assert 0.002 < max(hold_out["median_rmse_m"]) < 0.05
     assert 0.3 < hold_out["nees"]["mean_ratio"] < 3.0
 
