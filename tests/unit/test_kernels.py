@@ -43,7 +43,7 @@ def _points() -> Array:
 def test_lens_is_that_of_geometry(camera: Camera) -> None:
     points, model = _points(), MODEL_NAMES.index(camera.model)
     parameters, out = camera.parameters[None], np.zeros((len(points), 8))
-    shown = np.array([lens(model, parameters, 0, *p, o) for p, o in zip(points, out, strict=True)])
+    shown = np.array([lens(model, parameters, 0, p[0], p[1], p[2], o) for p, o in zip(points, out, strict=True)])
     image, by_point, _ = camera.lens.derivatives(points, camera.coefficients, np.asarray(camera.limit))
     assert np.array_equal(shown, np.isfinite(project(camera, points)).all(axis=1))
     assert 10 < shown.sum() < len(points)

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from typing import cast
 
 import numpy as np
+from numpy.typing import NDArray
 
 from georef.estimation.adjustment.batches import Work
 from georef.estimation.adjustment.block import KINDS_OF_POINT, Block, Indices, State
@@ -233,7 +234,7 @@ def _add_product(first: Indices, by: Array, other: Indices, other_by: Array, lay
     np.add.at(sums.corner, (a_rows[:, :, None], b_rows[:, None, :]), once)
 
 
-def _add_to_stations(first: Indices, other: Indices, product: Array, rows: Array, sums: Sums) -> None:
+def _add_to_stations(first: Indices, other: Indices, product: Array, rows: NDArray[np.bool_], sums: Sums) -> None:
     if not rows.any():
         return
     a, b, blocks = first[rows] // 6, other[rows] // 6, product[rows]

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import cast
 
 import numpy as np
-from scipy.linalg.lapack import dpotrf, dpotrs
+from scipy.linalg import get_lapack_funcs
 
 from georef.estimation.adjustment.block_cholesky import VANISHING_PIVOT, BlockCholesky, Pattern, SingularMatrix
 from georef.estimation.adjustment.reduced import Reduced
@@ -41,9 +41,10 @@ def _solve_border(matrix: Array, own: Array, right: Array, stations: int) -> Arr
     if len(bad):
         raise SingularMatrix(stations + int(bad[0]))
     scale = 1.0 / np.sqrt(own)
-    factor, failed = dpotrf(matrix * scale[:, None] * scale, lower=1)
+    potrf, potrs = get_lapack_funcs(("potrf", "potrs"), (matrix,))
+    factor, failed = potrf(matrix * scale[:, None] * scale, lower=1)
     low = np.flatnonzero(np.square(np.diag(factor)) < VANISHING_PIVOT)
     if failed or len(low):
         raise SingularMatrix(stations + int(failed - 1 if failed else low[0]))
-    solved, _ = dpotrs(factor, right * scale, lower=1)
+    solved, _ = potrs(factor, right * scale, lower=1)
     return cast(Array, solved * scale)
