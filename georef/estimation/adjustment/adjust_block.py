@@ -28,6 +28,7 @@ from georef.estimation.adjustment.shift_system import pose_shifts
 from georef.estimation.adjustment.solver import BlockSolution, SolverOptions, solve_block
 
 _GATE_ROUNDS, _ROBUST_ROUNDS = 3, 2
+_ROBUST_COST_TOLERANCE = 1e-5
 _FAR_OFF = 1.25  # of a sigma against its residuals
 _SETTLED_SHARE = 1e-4  # of the observations: a gate that drops fewer changes nothing
 _FACTOR_TOLERANCE = 0.05
@@ -92,7 +93,7 @@ def adjust_block(block: Block, options: BlockOptions) -> AdjustedBlock:
     search = _coherent(block, state, options)
     if search.blocks:
         lacking = _without_rows(block, search)
-        state = solve_block(lacking, losses=options.losses, options=options.solver, start=state).state
+        state = _robust_state(lacking, state, options)
         search = without_agreeing(search, block, state, quality(lacking, state).cofactors, options.gate_probability)
         block = _without_rows(block, search)
     block, rejected = without_contradictions(block, quality(block, state).constraints, gross)
@@ -138,12 +139,18 @@ def _robust(block: Block, state: State, options: BlockOptions) -> tuple[Block, S
     """The robust solution, with image sigmas near what the residuals show: a loss far too narrow fits too few."""
     scale = 1.0
     for _ in range(1 + _ROBUST_ROUNDS):
-        state = solve_block(block, losses=options.losses, options=options.solver, start=state).state
+        state = _robust_state(block, state, options)
         factor = min(max(quality(block, state).images.scale, 0.1), 10.0) if len(block.observations) else 1.0
         if 1.0 / _FAR_OFF < factor < _FAR_OFF:
             break
         block, scale = _scaled(block, factor), scale * factor
     return block, state, scale
+
+
+def _robust_state(block: Block, state: State, options: BlockOptions) -> State:
+    """The robust solution as closely as gates need it: reweighting converges slowly."""
+    solver = replace(options.solver, cost_tolerance=max(options.solver.cost_tolerance, _ROBUST_COST_TOLERANCE))
+    return solve_block(block, losses=options.losses, options=solver, start=state).state
 
 
 def _scaled(block: Block, factor: float) -> Block:
