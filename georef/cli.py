@@ -197,7 +197,7 @@ def view(
 
 
 def _run(project: Project, epoch: str) -> int:
-    """Runs all stages, a line for each; 3 where no image was localized."""
+    """Runs all stages, a line for each; 3 where no image was localized, or which poses are wrong cannot be decided."""
     from georef.pipeline import run_pipeline
 
     report = None
@@ -208,7 +208,7 @@ def _run(project: Project, epoch: str) -> int:
         say(f"{result.stage:<9} {result.summary.line}  [{cost}]")
         report = result.summary.data
     _say_published(project, epoch)
-    return 3 if report is not None and report["images"]["localized"] == 0 else 0
+    return 3 if report is not None and (report["images"]["localized"] == 0 or report["undecidable"]) else 0
 
 
 def _report_findings(findings: Iterable[Finding]) -> set[str]:

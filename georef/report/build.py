@@ -18,6 +18,8 @@ from georef.types.results import Localized, Outcome, Rejected
 SCHEMA = 1
 _NO_CHECK = {"count": 0, "kind": None, "rmse_e_m": None, "rmse_n_m": None, "rmse_h_m": None, "rmse_3d_m": None}
 
+_ADJUSTMENT = ("iterations", "converged", "image_sigma_scale", "coherent_blocks", "undecidable")
+
 
 @dataclass(frozen=True, eq=False)
 class ReportInput:
@@ -73,7 +75,7 @@ def build_report(given: ReportInput) -> dict[str, Any]:
         "control_points": _control_section(given),
         "gates": given.adjustment.get("gates", {}),
         "variance_components": given.adjustment.get("variance_components", {}),
-        "adjustment": {key: given.adjustment.get(key) for key in ("iterations", "converged", "image_sigma_scale")},
+        "adjustment": {key: given.adjustment.get(key) for key in _ADJUSTMENT},
         "plan": _plan(given),
         "timings": given.timings,
         "config": given.config,

@@ -106,6 +106,20 @@ def _of_images(report: dict[str, Any]) -> list[str]:
         gate = report["gates"].get(group, {})
         if gate.get("rejected"):
             out.append(f"{GROUPS[group]} rejected by the gate of the adjustment: {_names(gate['rejected_ids'])}.")
+    return [*out, *_coherent(report["adjustment"])]
+
+
+def _coherent(adjustment: dict[str, Any]) -> list[str]:
+    """Stretches of localized poses that are off by one shift."""
+    out = []
+    for wrong in adjustment.get("coherent_blocks") or ():
+        shift, sigma = (" / ".join(f"{1e3 * v:.0f}" for v in wrong[key]) for key in ("shift_m", "sigma_m"))
+        where = _names(wrong["stations"])
+        out.append(
+            f"Localized poses off by one shift, set aside: {where}, by {shift} mm east/north/up (1-sigma {sigma})."
+        )
+    if adjustment.get("undecidable"):
+        out.append("Which of these stretches is wrong and which is right, nothing but their number tells: add control.")
     return out
 
 

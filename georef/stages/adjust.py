@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from georef.config import AdjustConfig
 from georef.estimation.adjustment.adjust_block import AdjustedBlock, BlockOptions, adjust_block
 from georef.estimation.adjustment.block import KINDS_OF_POINT, KINDS_OF_POSE, Block
+from georef.estimation.adjustment.coherent import CoherentBlock
 from georef.estimation.adjustment.components import Component
 from georef.estimation.adjustment.constraint_terms import POSITION_PRIORS
 from georef.estimation.adjustment.eliminate import IMAGE_OBSERVATIONS
@@ -179,6 +180,8 @@ def _data(given: Block, adjusted: AdjustedBlock) -> dict[str, Any]:
         "gnss_positions": len(block.position_priors),
         "pose_priors": len(block.pose_priors),
         "gates": _gates(given, adjusted),
+        "coherent_blocks": [_coherent(wrong) for wrong in adjusted.wrong],
+        "undecidable": adjusted.undecidable,
         "variance_components": {
             GROUPS[name]: component_data(c) for name, c in adjusted.quality.components.items() if name in GROUPS
         },
@@ -205,6 +208,16 @@ def _gates(given: Block, adjusted: AdjustedBlock) -> dict[str, Any]:
     return {
         GROUPS[kind]: {"tested": count, "rejected": rejected[kind], "rejected_ids": names[kind]}
         for kind, count in tested.items()
+    }
+
+
+def _coherent(wrong: CoherentBlock) -> dict[str, Any]:
+    """Neighbouring stations whose localized poses are off by one shift: given minus adjusted, world axes."""
+    return {
+        "stations": list(wrong.station_ids),
+        "shift_m": wrong.shift_m.tolist(),
+        "sigma_m": np.sqrt(np.diag(wrong.cov)).tolist(),
+        "statistic": wrong.statistic,
     }
 
 
@@ -258,5 +271,7 @@ def _line(data: dict[str, Any]) -> str:
     return (
         f"{data['images']} images, {data['automatic_gcps']} automatic GCPs, {data['tie_points']} tie points, "
         f"{data['image_observations']} observations ({gate['rejected']} rejected), "
-        f"sigma0 {'-' if scale is None else f'{scale:.2f}'}" + ("" if data["converged"] else ", NOT CONVERGED")
+        f"sigma0 {'-' if scale is None else f'{scale:.2f}'}"
+        + ("" if data["converged"] else ", NOT CONVERGED")
+        + (", UNDECIDABLE which localized poses are wrong" if data["undecidable"] else "")
     )

@@ -239,7 +239,8 @@ def _timings(context: StageContext) -> dict[str, Any]:
 
 
 def _headline(report: dict[str, Any]) -> dict[str, Any]:
-    return {"images": report["images"], "check_points": report["check_points"]}
+    undecidable = bool(report["adjustment"]["undecidable"])
+    return {"images": report["images"], "check_points": report["check_points"], "undecidable": undecidable}
 
 
 def _line(report: dict[str, Any]) -> str:
