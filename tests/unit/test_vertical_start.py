@@ -24,7 +24,8 @@ def _observed(made: Flight, rng: np.random.Generator, *, wrong: float = 0.0) -> 
         view.append(np.full(len(seen), k))
         pixel.append(px[seen])
     count = sum(map(len, point))
-    return Observations(*map(np.concatenate, (point, view, pixel)), np.ones(count), np.full(count, -1))
+    joined = [np.concatenate(parts) for parts in (point, view, pixel)]
+    return Observations(joined[0], joined[1], joined[2], np.ones(count), np.full(count, -1))
 
 
 def _off_deg(made: Flight, found: Poses) -> np.ndarray:
