@@ -148,9 +148,8 @@ def _arrays(adjusted: AdjustedBlock | None, colors: NDArray[np.uint8]) -> dict[s
 
 def _scene_points(adjusted: AdjustedBlock) -> NDArray[np.int64]:
     """Tie points and automatic GCPs that the adjustment determined."""
-    shown = np.isfinite(adjusted.quality.images.points).all(axis=(1, 2))
-    shown[_points_of(adjusted.block, "control")] = False
-    return np.flatnonzero(shown)
+    determined = np.flatnonzero(np.isfinite(adjusted.quality.images.points).all(axis=(1, 2)))
+    return np.setdiff1d(determined, _points_of(adjusted.block, "control"))
 
 
 def _points_of(block: Block, kind: str) -> NDArray[np.int64]:

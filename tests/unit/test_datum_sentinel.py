@@ -172,7 +172,8 @@ def _in_zones(right: int, wrong: int) -> tuple[np.ndarray, np.ndarray, np.ndarra
     corner = Transformer.from_crs(4326, right, always_xy=True).transform(9.5, 50.0)
     frames = []
     for zone in (right, wrong):
-        lonlat = Transformer.from_crs(zone, 4326, always_xy=True).transform(*(positions[:, :2] + corner).T)
+        easting, northing = (positions[:, :2] + corner).T
+        lonlat = Transformer.from_crs(zone, 4326, always_xy=True).transform(easting, northing)
         geocentric = np.column_stack(to_earth.transform(*lonlat, positions[:, 2]))
         frames.append((geocentric - origin) @ world_from_earth.T)
     return frames[0], frames[1], heading

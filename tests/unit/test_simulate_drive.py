@@ -120,11 +120,12 @@ def test_what_is_calibrated_has_the_stated_errors() -> None:
         block, truth = drive.block, drive.truth
         for given, true in zip(block.mountings[1:], truth.rig_from_cam.to_list()[1:], strict=True):
             xi = given.rig_from_cam.local(true)
-            squares["mounting"].append(xi @ given.information @ xi)
+            assert given.information is not None
+            squares["mounting"].append(float(xi @ given.information @ xi))
         for given, true in zip(block.calibrations, truth.cameras, strict=True):
             names = given.camera.estimate
             changes = [(true.value(n) - given.camera.value(n)) / given.camera.unit(n) for n in names]
-            squares["calibration"].append(np.array(changes) @ given.information @ np.array(changes))
+            squares["calibration"].append(float(np.array(changes) @ given.information @ np.array(changes)))
         (antenna,), lever_arm = block.antennas, truth.lever_arms_m[0]
         error = lever_arm - antenna.lever_arm_m
         squares["lever arm"].append(error @ antenna.information @ error)
