@@ -144,7 +144,11 @@ def test_each_reference_has_its_own_sigma(tiny_tables: Path) -> None:
 @pytest.mark.parametrize(
     ("old", "new", "text"),
     [
-        ("[references.old]", "[references.second]", "a reference epoch and a new epoch or block have the same name: second"),
+        (
+            "[references.old]",
+            "[references.second]",
+            "a reference epoch and a new epoch or block have the same name: second",
+        ),
         ("[references.old]", "[references.reference]", "and not 'reference'"),
         ("[references.old]", "[reference]", r"a section \[reference\], or one \[references.NAME\]"),
         ("[0.004, 0.004, 0.004]", "[0.004, -1.0, 0.004]", "must be positive"),
