@@ -37,6 +37,7 @@ __all__ = [
     "check_point_errors",
     "evaluate_check_points",
     "mark_sigma_component",
+    "point_error",
 ]
 
 
@@ -188,7 +189,7 @@ def _errors(
         if isinstance(entry, str)
     ]
     covs = [None if joint is None else _blocks(joint, [i]) for i in range(len(pairs))]
-    determined = [_error(p, entry, cov) for (p, entry), cov in zip(pairs, covs, strict=True)]
+    determined = [point_error(p, entry, cov) for (p, entry), cov in zip(pairs, covs, strict=True)]
     return CheckPointErrors(tuple(determined), tuple(missing), joint)
 
 
@@ -207,7 +208,8 @@ def _blocks(joint: Array, rows: list[int]) -> Array:
     return joint[np.ix_(index, index)]
 
 
-def _error(point: CheckPoint, found: Intersection, predicted_cov: Array | None) -> CheckPointError:
+def point_error(point: CheckPoint, found: Intersection, predicted_cov: Array | None) -> CheckPointError:
+    """What an intersected point differs by."""
     return CheckPointError(
         point.point_id,
         point.kind,

@@ -27,6 +27,7 @@ from georef.geometry.camera import Camera
 from georef.geometry.poses import Poses
 from georef.geometry.rigid import Array, Rigid3
 from georef.types.scene import Observations
+from tests.worlds.dense_normals import sparse
 from tests.worlds.rig_blocks import rig_block
 
 CAMERA = Camera("cam", 4000, 3000, 2000.0, 2000.0, 2000.0, 1500.0)
@@ -106,26 +107,7 @@ def with_prior(block: Block, image: int) -> Block:
 
 def reduced_of(block: Block) -> Reduced:
     """The reduced normal equations with all station pairs in their pattern that are not zero."""
-    layout = Layout.of(block)
-    matrix, gradient = BlockGraph(block, block.start()).reduced()
-    stations, count = 6 * layout.stations, layout.stations
-    rows, columns, blocks = [0], [], []
-    for i in range(count):
-        for j in range(i, count):
-            part = matrix[6 * i : 6 * i + 6, 6 * j : 6 * j + 6]
-            if i == j or part.any():
-                columns.append(j)
-                blocks.append(part)
-        rows.append(len(columns))
-    return Reduced(
-        layout,
-        np.array(rows),
-        np.array(columns),
-        np.array(blocks),
-        matrix[:stations, stations:],
-        matrix[stations:, stations:],
-        gradient,
-    )
+    return sparse(Layout.of(block), *BlockGraph(block, block.start()).reduced())
 
 
 def explained(block: Block) -> str | None:

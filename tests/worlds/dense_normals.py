@@ -100,6 +100,7 @@ def reduced_of(found: Equations) -> Reduced:
 
 
 def sparse(layout: Layout, normal: Array, gradient: Array) -> Reduced:
+    """A dense normal matrix with all station pairs in its pattern that are not zero."""
     edge, first, column, blocks = 6 * layout.stations, [0], [], []
     for i in range(layout.stations):
         for j in range(i, layout.stations):

@@ -25,6 +25,7 @@ from georef.estimation.adjustment.block import (
     State,
 )
 from georef.estimation.adjustment.reduced import Layout
+from georef.estimation.adjustment.solver import moved_state
 from georef.geometry.camera import Camera
 from georef.geometry.poses import Poses
 from georef.geometry.projection import Views
@@ -206,21 +207,5 @@ def _control(truth: State, rng: np.random.Generator) -> PointPriors:
 
 def moved(block: Block, state: State, step: Array, points: Array | None = None) -> State:
     """The state after a step (6 S + border,) of the reduced unknowns, and steps (P, 3) of the points."""
-    layout = Layout.of(block)
-    stations, border = step[: 6 * layout.stations].reshape(-1, 6), step[6 * layout.stations :]
-
-    def taken(starts: Indices, size: int) -> Array:
-        return np.array([border[s : s + size] if s >= 0 else np.zeros(size) for s in starts]).reshape(-1, size)
-
-    cameras = tuple(
-        camera.changed(camera.estimate, border[s : s + len(camera.estimate)]) if s >= 0 else camera
-        for s, camera in zip(layout.calibration, state.cameras, strict=True)
-    )
-    return State(
-        state.world_from_rig.retract(stations),
-        state.rig_from_cam.retract(taken(layout.mounting, 6)),
-        cameras,
-        state.lever_arms_m + taken(layout.antenna, 3),
-        state.drift_m + taken(layout.drift, 3),
-        state.points + taken(layout.kept_point, 3) + (0.0 if points is None else points),
-    )
+    after = moved_state(Layout.of(block), state, step)
+    return after if points is None else replace(after, points=after.points + points)

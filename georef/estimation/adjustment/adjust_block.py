@@ -88,8 +88,8 @@ def adjust_block(block: Block, options: BlockOptions) -> AdjustedBlock:
     changed. Raises GeorefError where the constraints leave the datum open.
     """
     given, gross = block, 1.0 - _GROSS * (1.0 - options.gate_probability)
-    block, state, scale = _robust(block, block.start(), options)
-    block, _ = _gate_images(block, state, quality(block, state), gross)
+    block, state, scale, found = _robust(block, block.start(), options)
+    block, _ = _gate_images(block, found, gross)
     search = _coherent(block, state, options)
     if search.blocks:
         lacking = _without_rows(block, search)
@@ -98,18 +98,17 @@ def adjust_block(block: Block, options: BlockOptions) -> AdjustedBlock:
         block = _without_rows(block, search)
     block, rejected = without_contradictions(block, quality(block, state).constraints, gross)
     solution = solve_block(block, options=options.solver, start=state)
-    block, solution, scale = _rescaled(block, solution, scale, options)
+    block, solution, scale, found = _rescaled(block, solution, scale, quality(block, solution.state), options)
     for _ in range(_GATE_ROUNDS):
-        found = quality(block, solution.state)
         kept, more = without_contradictions(block, found.constraints, options.gate_probability)
-        kept, dropped = _gate_images(kept, solution.state, found, options.gate_probability)
+        kept, dropped = _gate_images(kept, found, options.gate_probability)
         if not more and dropped <= _SETTLED_SHARE * len(given.observations):
             break
         block, rejected = kept, rejected + more
         solution = solve_block(block, options=options.solver, start=solution.state)
-    block, solution, scale = _rescaled(block, solution, scale, options)
+        found = quality(block, solution.state)
+    block, solution, scale, found = _rescaled(block, solution, scale, found, options)
     dropped = len(given.observations) - len(block.observations)
-    found = quality(block, solution.state)
     return AdjustedBlock(block, solution, found, rejected, search.blocks, search.undecidable, dropped, scale)
 
 
@@ -135,16 +134,17 @@ def _inverted(block: Block, state: State, lin: Linearized) -> Cofactors:
         ) from None
 
 
-def _robust(block: Block, state: State, options: BlockOptions) -> tuple[Block, State, float]:
+def _robust(block: Block, state: State, options: BlockOptions) -> tuple[Block, State, float, Quality]:
     """The robust solution, with image sigmas near what the residuals show: a loss far too narrow fits too few."""
     scale = 1.0
     for _ in range(1 + _ROBUST_ROUNDS):
         state = _robust_state(block, state, options)
-        factor = min(max(quality(block, state).images.scale, 0.1), 10.0) if len(block.observations) else 1.0
+        found = quality(block, state)
+        factor = min(max(found.images.scale, 0.1), 10.0)
         if 1.0 / _FAR_OFF < factor < _FAR_OFF:
-            break
+            return block, state, scale, found
         block, scale = _scaled(block, factor), scale * factor
-    return block, state, scale
+    return block, state, scale, quality(block, state)
 
 
 def _robust_state(block: Block, state: State, options: BlockOptions) -> State:
@@ -162,7 +162,7 @@ def _scaled(block: Block, factor: float) -> Block:
     return replace(block, observations=block.observations.scaled(factor), point_priors=given)
 
 
-def _gate_images(block: Block, state: State, found: Quality, probability: float) -> tuple[Block, int]:
+def _gate_images(block: Block, found: Quality, probability: float) -> tuple[Block, int]:
     """The block without image observations that contradict the rest, and how many they are."""
     bad = found.images.rejected(probability, found.images.scale)
     return replace(block, observations=block.observations.take(~bad)), int(bad.sum())
@@ -187,13 +187,13 @@ def _without_rows(block: Block, search: CoherentSearch) -> Block:
 
 
 def _rescaled(
-    block: Block, solution: BlockSolution, scale: float, options: BlockOptions
-) -> tuple[Block, BlockSolution, float]:
-    """The image sigmas brought to what the residuals show, and the solution for them."""
-    if not len(block.observations):
-        return block, solution, scale
-    factor = quality(block, solution.state).components[IMAGE_OBSERVATIONS].factor
+    block: Block, solution: BlockSolution, scale: float, found: Quality, options: BlockOptions
+) -> tuple[Block, BlockSolution, float, Quality]:
+    """The image sigmas brought to what the residuals show, the solution for them and its quality."""
+    component = found.components.get(IMAGE_OBSERVATIONS)
+    factor = None if component is None else component.factor
     if factor is None or abs(factor - 1.0) < _FACTOR_TOLERANCE:
-        return block, solution, scale
+        return block, solution, scale, found
     block = _scaled(block, factor)
-    return block, solve_block(block, options=options.solver, start=solution.state), scale * factor
+    solution = solve_block(block, options=options.solver, start=solution.state)
+    return block, solution, scale * factor, quality(block, solution.state)

@@ -15,7 +15,7 @@ import numpy as np
 
 from georef.estimation.adjustment.block import Block, State
 from georef.estimation.adjustment.reduced import Layout
-from georef.evaluation.check_points import CheckPointError, CheckPointErrors, NotDetermined
+from georef.evaluation.check_points import CheckPointErrors, NotDetermined, point_error
 from georef.evaluation.forward_intersection import Intersection, PosedImages, intersect
 from georef.geometry.camera import intrinsic_derivatives
 from georef.geometry.covariance import symmetric
@@ -73,7 +73,7 @@ def check_block(
         if isinstance(entry, str)
     ]
     errors = [
-        _error(point, entry, joint[3 * i : 3 * i + 3, 3 * i : 3 * i + 3]) for i, (point, entry) in enumerate(pairs)
+        point_error(point, entry, joint[3 * i : 3 * i + 3, 3 * i : 3 * i + 3]) for i, (point, entry) in enumerate(pairs)
     ]
     return BlockCheck(CheckPointErrors(tuple(errors), tuple(missing), joint), by_unknowns, solved)
 
@@ -144,15 +144,3 @@ def _derivative(
         by_camera = intrinsic_derivatives(images.cameras[image], in_cam, names)[0] / mark.sigma_px
         out[:, edge + first : edge + first + len(names)] += by_marks[:, 2 * row : 2 * row + 2] @ by_camera
     return out
-
-
-def _error(point: CheckPoint, found: Intersection, cov: Array) -> CheckPointError:
-    return CheckPointError(
-        point.point_id,
-        point.kind,
-        found.point - point.point_in_world,
-        len(found.images),
-        len(found.residual_px),
-        float(np.sqrt(np.mean(np.square(found.residual_px)))),
-        cov,
-    )

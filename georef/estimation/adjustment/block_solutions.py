@@ -18,6 +18,7 @@ from georef.estimation.adjustment.block_check import BlockCheck, check_block
 from georef.estimation.adjustment.cofactors import Cofactors, cofactors
 from georef.estimation.adjustment.eliminate import IMAGE_OBSERVATIONS, normal_equations
 from georef.estimation.adjustment.prepared import Prepared
+from georef.estimation.adjustment.problem import mark_observations
 from georef.estimation.adjustment.reduced import Layout
 from georef.estimation.adjustment.solver import BlockSolution, SolverOptions, solve_block
 from georef.geometry.rigid import Array
@@ -95,16 +96,7 @@ def solved(block: Block, start: State, check: Sequence[CheckPoint], config: Adju
 
 def with_control(block: Block, control: Sequence[ControlPoint]) -> Block:
     """The block with surveyed points, which start from their given coordinates, and their marks."""
-    index = {name: i for i, name in enumerate(block.image_ids)}
-    first = len(block.points)
-    marks = [(k, mark) for k, point in enumerate(control) for mark in point.marks if mark.image_id in index]
-    added = Observations(
-        point=np.array([first + k for k, _ in marks], dtype=np.int64),
-        view=np.array([index[mark.image_id] for _, mark in marks], dtype=np.int64),
-        pixel=np.array([mark.pixel for _, mark in marks]).reshape(-1, 2),
-        sigma_px=np.array([mark.sigma_px for _, mark in marks]),
-        keypoint=np.full(len(marks), -1),
-    )
+    first, marks = len(block.points), mark_observations(control, block.image_ids)
     positions = np.array([point.point_in_world for point in control]).reshape(-1, 3)
     priors = PointPriors(
         point=first + np.arange(len(control)),
@@ -116,7 +108,7 @@ def with_control(block: Block, control: Sequence[ControlPoint]) -> Block:
     return replace(
         block,
         points=np.concatenate([block.points, positions]),
-        observations=Observations.joined([block.observations, added]),
+        observations=Observations.joined([block.observations, marks.with_points(first + marks.point)]),
         point_priors=priors,
     )
 

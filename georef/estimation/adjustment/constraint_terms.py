@@ -55,6 +55,16 @@ def constraint_terms(block: Block, state: State, layout: Layout | None = None) -
     return [term for term in terms if len(term.row)]
 
 
+def dense_columns(columns: Columns, rows: Indices, width: int, size: int) -> Array:
+    """Derivatives (U, k m), by all U = size unknowns of the reduced system, of chosen rows of constraints."""
+    out = np.zeros((size, len(rows), width))
+    for first, by in columns:
+        here = np.flatnonzero(first[rows] >= 0)
+        at = first[rows[here]][:, None] + np.arange(by.shape[2])
+        out[at[:, :, None], here[:, None, None], np.arange(width)] = np.swapaxes(by[rows[here]], 1, 2)
+    return out.reshape(size, -1)
+
+
 def whitening(cov: Array) -> Array:
     """W (K, m, m) with W' W the inverse of covariances (K, m, m)."""
     return cast(Array, np.linalg.inv(np.linalg.cholesky(cov)))

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from georef.estimation.adjustment.batches import Work
 from georef.estimation.adjustment.block import KINDS_OF_POINT, Block, Indices, State
-from georef.estimation.adjustment.constraint_terms import Term, constraint_terms
+from georef.estimation.adjustment.constraint_terms import Term, constraint_terms, root
 from georef.estimation.adjustment.kernels_eliminate import Sums, eliminate_points
 from georef.estimation.adjustment.kernels_move import all_cost
 from georef.estimation.adjustment.prepared import Prepared, placed
@@ -162,9 +162,9 @@ def term_scales(block: Block, term: Term, losses: Losses) -> Array | float:
 
 def weighted(term: Term, weight: Array) -> Term:
     """The same constraints with weights (K,) applied."""
-    root = np.sqrt(weight)
-    columns = tuple((first, by * root[:, None, None]) for first, by in term.columns)
-    return replace(term, residual=term.residual * root[:, None], columns=columns)
+    factor = np.sqrt(weight)
+    columns = tuple((first, by * factor[:, None, None]) for first, by in term.columns)
+    return replace(term, residual=term.residual * factor[:, None], columns=columns)
 
 
 def _point_scales(block: Block, losses: Losses) -> Array:
@@ -187,11 +187,10 @@ def _kept_priors(block: Block, state: State, layout: Layout) -> list[Term]:
     row = np.flatnonzero(first >= 0)
     if not len(row):
         return []
-    values, vectors = np.linalg.eigh(priors.information[row])
-    root = np.sqrt(np.maximum(values, 0.0))[:, :, None] * np.swapaxes(vectors, 1, 2)
+    weight = root(priors.information[row])
     off = state.points[priors.point[row]] - priors.position[row]
-    residual = np.einsum("kij,kj->ki", root, off)
-    return [Term(KINDS_OF_POINT[0], residual, ((6 * layout.stations + first[row], root),), row)]
+    residual = np.einsum("kij,kj->ki", weight, off)
+    return [Term(KINDS_OF_POINT[0], residual, ((6 * layout.stations + first[row], weight),), row)]
 
 
 def _symmetric_diagonals(sums: Sums) -> Array:

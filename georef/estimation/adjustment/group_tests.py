@@ -18,7 +18,14 @@ from scipy.stats import chi2
 from georef.estimation.adjustment.block import KINDS_OF_POINT, KINDS_OF_POSE, Block, Indices, State
 from georef.estimation.adjustment.cofactors import Cofactors
 from georef.estimation.adjustment.components import Component
-from georef.estimation.adjustment.constraint_terms import POSE_PRIORS, POSITION_PRIORS, Term, constraint_terms, root
+from georef.estimation.adjustment.constraint_terms import (
+    POSE_PRIORS,
+    POSITION_PRIORS,
+    Term,
+    constraint_terms,
+    dense_columns,
+    root,
+)
 from georef.estimation.adjustment.eliminate import IMAGE_OBSERVATIONS, GivenPoints
 from georef.estimation.adjustment.kernels_cofactors import (
     RANK_TOLERANCE,
@@ -191,13 +198,8 @@ def joint_test(terms: list[tuple[Term, Indices]], found: Cofactors) -> tuple[flo
     arrays) of each term."""
     residual, design = [], []
     for term, rows in terms:
-        m, part = term.residual.shape[1], np.zeros((found.layout.size, len(rows), term.residual.shape[1]))
-        for first, by in term.columns:
-            here = np.flatnonzero(first[rows] >= 0)
-            at = first[rows[here]][:, None] + np.arange(by.shape[2])
-            part[at[:, :, None], here[:, None, None], np.arange(m)] = np.swapaxes(by[rows[here]], 1, 2)
         residual.append(term.residual[rows].ravel())
-        design.append(part.reshape(found.layout.size, -1))
+        design.append(dense_columns(term.columns, rows, term.residual.shape[1], found.layout.size))
     whole = np.concatenate(design, axis=1)
     cofactor = np.eye(whole.shape[1]) - whole.T @ found.apply(whole)
     statistic, dof = group_statistics(np.concatenate(residual)[None], cofactor[None])

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -141,10 +141,15 @@ def control_observations(problem: Problem) -> Observations:
 
     Marks in images that are not part of the problem are left out.
     """
-    index = {name: i for i, name in enumerate(problem.image_ids)}
+    return mark_observations(problem.control, problem.image_ids)
+
+
+def mark_observations(points: Sequence[ControlPoint], image_ids: Sequence[str]) -> Observations:
+    """The marks that control points have in some images; point index is the position among the points."""
+    index = {name: i for i, name in enumerate(image_ids)}
     rows = [
         (p, index[mark.image_id], mark.pixel, mark.sigma_px)
-        for p, point in enumerate(problem.control)
+        for p, point in enumerate(points)
         for mark in point.marks
         if mark.image_id in index
     ]

@@ -16,7 +16,7 @@ from scipy.sparse import coo_array, csr_array
 
 from georef.estimation.adjustment.block import Block, Indices, State
 from georef.estimation.adjustment.cofactors import Cofactors
-from georef.estimation.adjustment.constraint_terms import Columns
+from georef.estimation.adjustment.constraint_terms import Columns, dense_columns
 from georef.estimation.reference_errors import ReferenceErrors
 from georef.geometry.projection import linearize
 from georef.geometry.rigid import Array
@@ -56,7 +56,7 @@ class ReferencePart:
     def of_rows(self, columns: Columns, width: int) -> Array:
         """The same for K groups of m values (K, m, m): columns as those of a `Term`."""
         size = self.found.layout.size
-        return self._in_chunks(lambda rows: _dense_columns(columns, rows, width, size), len(columns[0][0]), width)
+        return self._in_chunks(lambda rows: dense_columns(columns, rows, width, size), len(columns[0][0]), width)
 
     def of_given_points(self, block: Block, state: State, rows: Indices) -> Array:
         """What the references add to the covariances (K, 3, 3) of given points: rows of the point priors."""
@@ -83,16 +83,6 @@ class ReferencePart:
         from_references: Any = self.by_reference.T
         gains = (from_references @ self.found.apply(derivatives)).reshape(-1, 6, derivatives.shape[1])
         return np.swapaxes(gains, 1, 2)
-
-
-def _dense_columns(columns: Columns, rows: Indices, width: int, size: int) -> Array:
-    """Derivatives (U, K m) of the chosen rows of constraints."""
-    out = np.zeros((size, len(rows), width))
-    for first, by in columns:
-        here = np.flatnonzero(first[rows] >= 0)
-        at = first[rows[here]][:, None] + np.arange(by.shape[2])
-        out[at[:, :, None], here[:, None, None], np.arange(width)] = np.swapaxes(by[rows[here]], 1, 2)
-    return out.reshape(size, -1)
 
 
 def _coupling(block: Block, state: State, found: Cofactors, right: Array) -> Iterator[Placed]:
