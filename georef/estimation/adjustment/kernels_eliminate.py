@@ -26,13 +26,14 @@ class Sums(NamedTuple):
 
 
 @kernel
-def eliminate_points(tracks, images, placed, points, information, shift, damping, cauchy, sums, work):
-    """Adds all image observations, their points eliminated; cost, observations no lens shows, undetermined points.
+def eliminate_points(tracks, images, placed, points, information, shift, damping, cauchy, pairs, sums, back, work):
+    """Adds all image observations, their points eliminated; cost, observations no lens shows, undetermined points, and
+    by how much the (damped) cost falls if points alone move.
 
     points (P, 3); information (K, 3, 3) and its products with given positions (K, 3) of point priors; damping is
-    relative to the diagonal of points.
+    relative to the diagonal of points. back: filled, unless it is empty.
     """
-    cost, hidden, undetermined = 0.0, 0, 0
+    cost, hidden, undetermined, gain = 0.0, 0, 0, 0.0
     rays, slots, shared = work.rays, work.slots, work.shared
     border = sums.corner.shape[0] > 0
     for begin in range(0, tracks.point.shape[0], BATCH):
@@ -43,14 +44,35 @@ def eliminate_points(tracks, images, placed, points, information, shift, damping
         sum_stations(count, slots.first[end - begin], rays, slots)
         undetermined += point_normals(tracks, begin, end, placed, points, information, shift, damping, slots)
         _add_stations(slots.first[end - begin], slots, sums)
-        _roots_of_stations(tracks, begin, end, slots, sums)
-        _subtract_stations(tracks, begin, end, slots, sums)
+        gain += _roots_of_stations(tracks, begin, end, slots, sums)
+        _subtract_stations(tracks, begin, end, pairs, slots, sums)
+        if back.right.shape[0] > 0:
+            _leave(tracks, begin, end, pairs.slot[begin], slots, back)
         if border:
             share(tracks, begin, end, images, placed, rays)
             keep(tracks, begin, end, placed, rays, slots)
             _add_shared(count, rays, slots, sums)
             _subtract_shared(tracks, begin, end, placed, rays, slots, shared, sums)
-    return cost, hidden, undetermined
+    return cost, hidden, undetermined, gain
+
+
+@kernel
+def _leave(tracks, begin, end, slot, slots, back):
+    """Keeps what back-substitution needs; slot: number of the batch's first one."""
+    for s in range(slots.first[end - begin]):
+        square = slots.square
+        back.square[slot + s, 0], back.square[slot + s, 1] = square[s, 0, 0], square[s, 0, 1]
+        back.square[slot + s, 2], back.square[slot + s, 3] = square[s, 0, 2], square[s, 1, 1]
+        back.square[slot + s, 4], back.square[slot + s, 5] = square[s, 1, 2], square[s, 2, 2]
+    for p in range(end - begin):
+        if tracks.kept[begin + p] >= 0:
+            continue
+        root = slots.root
+        back.root[begin + p, 0], back.root[begin + p, 1] = root[p, 0, 0], root[p, 1, 0]
+        back.root[begin + p, 2], back.root[begin + p, 3] = root[p, 1, 1], root[p, 2, 0]
+        back.root[begin + p, 4], back.root[begin + p, 5] = root[p, 2, 1], root[p, 2, 2]
+        for i in range(3):
+            back.right[begin + p, i] = slots.right[p, i]
 
 
 @kernel
@@ -91,8 +113,8 @@ def _add_stations(count, slots, sums):
 @kernel
 def _roots_of_stations(tracks, begin, end, slots, sums):
     """E of all slots, with W N^-1 W' = E'E; what elimination takes off the gradients. Leaves L^-1 times the points'
-    gradients in `right`."""
-    e, gradient = slots.eliminated, sums.gradient
+    gradients in `right`; half the sum of their squares."""
+    e, gradient, gain = slots.eliminated, sums.gradient, 0.0
     for p in range(end - begin):
         if tracks.kept[begin + p] >= 0:
             continue
@@ -101,6 +123,7 @@ def _roots_of_stations(tracks, begin, end, slots, sums):
         g0, g1, g2 = slots.right[p, 0], slots.right[p, 1], slots.right[p, 2]
         h0, h1, h2 = r00 * g0, r10 * g0 + r11 * g1, r20 * g0 + r21 * g1 + r22 * g2
         slots.right[p, 0], slots.right[p, 1], slots.right[p, 2] = h0, h1, h2
+        gain += h0 * h0 + h1 * h1 + h2 * h2
         for s in range(slots.first[p], slots.first[p + 1]):
             x, y, z = slots.q[s, 0], slots.q[s, 1], slots.q[s, 2]
             for i in range(3):
@@ -114,21 +137,21 @@ def _roots_of_stations(tracks, begin, end, slots, sums):
             at = 6 * slots.station[s]
             for i in range(6):
                 gradient[at + i] -= e[s, 0, i] * h0 + e[s, 1, i] * h1 + e[s, 2, i] * h2
+    return 0.5 * gain
 
 
 @kernel
-def _subtract_stations(tracks, begin, end, slots, sums):
+def _subtract_stations(tracks, begin, end, pairs, slots, sums):
     """W N^-1 W' of all pairs of a point's stations."""
-    e, block, first, column = slots.eliminated, sums.block, sums.first, sums.column
+    e, block = slots.eliminated, sums.block
     for p in range(end - begin):
         if tracks.kept[begin + p] >= 0:
             continue
+        pair = pairs.first[begin + p]
         for s in range(slots.first[p], slots.first[p + 1]):
-            entry = first[slots.station[s]]
             for other in range(s, slots.first[p + 1]):
-                there = slots.station[other]
-                while column[entry] != there:
-                    entry += 1
+                entry = pairs.entry[pair]
+                pair += 1
                 for i in range(6):
                     a, b, c = e[s, 0, i], e[s, 1, i], e[s, 2, i]
                     for j in range(6):

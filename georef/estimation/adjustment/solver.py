@@ -17,9 +17,9 @@ from georef.errors import GeorefError
 from georef.estimation.adjustment.block import Block, State
 from georef.estimation.adjustment.block_cholesky import SingularMatrix
 from georef.estimation.adjustment.eliminate import Linearized, Losses
-from georef.estimation.adjustment.equations import BlockEquations, Equations
+from georef.estimation.adjustment.equations import BlockEquations, Equations, Moved
 from georef.estimation.adjustment.prepared import Prepared
-from georef.estimation.adjustment.reduced_solve import reduced_step
+from georef.estimation.adjustment.reduced_solve import StepSolver
 from georef.geometry.rigid import Array
 
 _log = logging.getLogger(__name__)
@@ -105,7 +105,7 @@ class _Solver:
 
     def __init__(self, block: Block, options: SolverOptions, equations: Equations) -> None:
         self._block, self._options, self._equations = block, options, equations
-        self._pattern, self._hidden_cost = equations.pattern, equations.hidden_cost
+        self._steps, self._hidden_cost = StepSolver(equations.pattern), equations.hidden_cost
 
     def run(self, state: State, on_iteration: Callable[[Iteration], None] | None) -> BlockSolution:
         damping, number = self._options.damping, 0
@@ -153,13 +153,13 @@ class _Solver:
     def _trial(self, state: State, lin: Linearized, damping: float, before: float) -> _Trial | None:
         """The step at a damping from a state of cost `before`; None where the equations have no solution at it."""
         try:
-            step = reduced_step(lin.reduced, self._pattern, damping * lin.diagonal)
+            step = self._steps.step(lin.reduced, damping * lin.diagonal)
         except SingularMatrix as error:
             if damping > 0.0:
                 return None
             raise self._singular(error, state, lin) from None
         moved = self._equations.moved(state, step, damping)
-        gained, promised = before - moved.cost, moved.promised
+        gained, promised = before - moved.cost, promised_decrease(lin, step, damping, moved)
         lost = abs(promised) <= _ROUNDING * before and abs(gained) <= _ROUNDING * before
         ratio = 1.0 if lost else (gained / promised if promised > 0.0 else -1.0)
         return _Trial(step, moved.state, moved.cost, float(ratio), moved.hidden)
@@ -175,3 +175,13 @@ class _Solver:
             explain_singular(self._block, state, lin.reduced)
             or "Add control points, GNSS positions or pose priors, or hold unknowns that nothing determines.",
         )
+
+
+def promised_decrease(lin: Linearized, step: Array, damping: float, moved: Moved) -> float:
+    """Decrease of the cost of the linear model by a step that solves its damped equations.
+
+    With the damped model m_d = m + damping / 2 step' D step, D the diagonal, and its minimum at the step, the points'
+    own among it, m_d falls by the gain of points alone less half the product of reduced gradient and step.
+    """
+    squares = moved.squares + float(lin.diagonal @ np.square(step))
+    return lin.gain - 0.5 * float(lin.reduced.gradient @ step) + 0.5 * damping * squares
