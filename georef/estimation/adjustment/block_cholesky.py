@@ -141,7 +141,7 @@ class BlockCholesky:
         return self.back_solved(self.half_solved(right))
 
     def half_solved(self, right: Array) -> Array:
-        """L^-1 S times vectors (6 S,) or (6 S, m); columns may be zero at most stations, as a drift knows its street."""
+        """L^-1 S times vectors (6 S,) or (6 S, m); columns may be zero at most stations (a drift)."""
         flat = right.ndim == 1
         x = np.asfortranarray((right[:, None] if flat else right) * self.scale[:, None])
         for own, rest, corner, below in self._parts():

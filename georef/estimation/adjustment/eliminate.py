@@ -86,7 +86,7 @@ def normal_equations(
         scale = term_scales(block, term, losses)
         cost += 0.0 if term.name in KINDS_OF_POINT else cost_of_squares(square, scale)
         _add(weighted(term, robust_weight(square, scale)), layout, sums)
-    sums.block[:] = _symmetric_diagonals(sums)
+    sums.block[:] = _whole_diagonals(sums)
     corner = sums.corner + sums.corner.T - np.diag(np.diag(sums.corner))
     border = sums.border.reshape(6 * layout.stations, layout.border)
     reduced = Reduced(layout, prepared.first, prepared.column, sums.block, border, corner, sums.gradient)
@@ -176,10 +176,11 @@ def _kept_priors(block: Block, state: State, layout: Layout) -> list[Term]:
     return [Term(KINDS_OF_POINT[0], residual, ((6 * layout.stations + first[row], weight),), row)]
 
 
-def _symmetric_diagonals(sums: Sums) -> Array:
-    """All blocks, the diagonal ones freed of what rounding leaves unsymmetric."""
+def _whole_diagonals(sums: Sums) -> Array:
+    """All blocks, the diagonal ones, of which only upper triangles are summed, made whole."""
     own = sums.first[:-1]
-    sums.block[own] = 0.5 * (sums.block[own] + np.swapaxes(sums.block[own], 1, 2))
+    upper = np.triu(sums.block[own])
+    sums.block[own] = upper + np.swapaxes(np.triu(upper, 1), 1, 2)
     return sums.block
 
 

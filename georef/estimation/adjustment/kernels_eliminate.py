@@ -77,37 +77,52 @@ def _leave(tracks, begin, end, slot, slots, back):
 
 @kernel
 def _add_stations(count, slots, sums):
-    """The stations' own normal matrices T'MT and gradients T'g, T = [[q]x, -I], of all slots."""
-    f = np.empty((6, 3))
+    """The stations' own normal matrices T'MT (upper triangles) and gradients T'g, T = [[q]x, -I], of all slots."""
     block, gradient, diagonal = sums.block, sums.gradient, sums.diagonal
     for s in range(count):
         station = slots.station[s]
         own, at = sums.first[station], 6 * station
         x, y, z = slots.q[s, 0], slots.q[s, 1], slots.q[s, 2]
-        for j in range(3):  # T'M
-            m0, m1, m2 = slots.square[s, 0, j], slots.square[s, 1, j], slots.square[s, 2, j]
-            f[0, j], f[1, j], f[2, j] = z * m1 - y * m2, x * m2 - z * m0, y * m0 - x * m1
-            f[3, j], f[4, j], f[5, j] = -m0, -m1, -m2
-        for i in range(6):
-            a, b, c = f[i, 0], f[i, 1], f[i, 2]
-            block[own, i, 0] += b * z - c * y
-            block[own, i, 1] += c * x - a * z
-            block[own, i, 2] += a * y - b * x
-            block[own, i, 3] -= a
-            block[own, i, 4] -= b
-            block[own, i, 5] -= c
-        g0, g1, g2 = slots.slope[s, 0], slots.slope[s, 1], slots.slope[s, 2]
-        gradient[at] += z * g1 - y * g2
-        gradient[at + 1] += x * g2 - z * g0
-        gradient[at + 2] += y * g0 - x * g1
-        gradient[at + 3] -= g0
-        gradient[at + 4] -= g1
-        gradient[at + 5] -= g2
-        diagonal[at] += f[0, 1] * z - f[0, 2] * y
-        diagonal[at + 1] += f[1, 2] * x - f[1, 0] * z
-        diagonal[at + 2] += f[2, 0] * y - f[2, 1] * x
-        for i in range(3):
-            diagonal[at + 3 + i] -= f[3 + i, i]
+        a, b, c = slots.square[s, 0, 0], slots.square[s, 0, 1], slots.square[s, 0, 2]
+        d, e, f = slots.square[s, 1, 1], slots.square[s, 1, 2], slots.square[s, 2, 2]
+        u, v, w = slots.slope[s, 0], slots.slope[s, 1], slots.slope[s, 2]
+        m00, m01, m02 = z * b - y * c, z * d - y * e, z * e - y * f  # [q]x' M
+        m10, m11, m12 = x * c - z * a, x * e - z * b, x * f - z * c
+        m20, m21, m22 = y * a - x * b, y * b - x * d, y * c - x * e
+        d0, d1, d2 = m01 * z - m02 * y, m12 * x - m10 * z, m20 * y - m21 * x
+        block[own, 0, 0] += d0
+        block[own, 0, 1] += m02 * x - m00 * z
+        block[own, 0, 2] += m00 * y - m01 * x
+        block[own, 0, 3] -= m00
+        block[own, 0, 4] -= m01
+        block[own, 0, 5] -= m02
+        block[own, 1, 1] += d1
+        block[own, 1, 2] += m10 * y - m11 * x
+        block[own, 1, 3] -= m10
+        block[own, 1, 4] -= m11
+        block[own, 1, 5] -= m12
+        block[own, 2, 2] += d2
+        block[own, 2, 3] -= m20
+        block[own, 2, 4] -= m21
+        block[own, 2, 5] -= m22
+        block[own, 3, 3] += a
+        block[own, 3, 4] += b
+        block[own, 3, 5] += c
+        block[own, 4, 4] += d
+        block[own, 4, 5] += e
+        block[own, 5, 5] += f
+        gradient[at] += z * v - y * w
+        gradient[at + 1] += x * w - z * u
+        gradient[at + 2] += y * u - x * v
+        gradient[at + 3] -= u
+        gradient[at + 4] -= v
+        gradient[at + 5] -= w
+        diagonal[at] += d0
+        diagonal[at + 1] += d1
+        diagonal[at + 2] += d2
+        diagonal[at + 3] += a
+        diagonal[at + 4] += d
+        diagonal[at + 5] += f
 
 
 @kernel
@@ -125,18 +140,29 @@ def _roots_of_stations(tracks, begin, end, slots, sums):
         slots.right[p, 0], slots.right[p, 1], slots.right[p, 2] = h0, h1, h2
         gain += h0 * h0 + h1 * h1 + h2 * h2
         for s in range(slots.first[p], slots.first[p + 1]):
+            m, at = slots.mixed, 6 * slots.station[s]
             x, y, z = slots.q[s, 0], slots.q[s, 1], slots.q[s, 2]
+            m00, m01, m02 = m[s, 0, 0], m[s, 0, 1], m[s, 0, 2]
+            m10, m11, m12 = m[s, 1, 0], m[s, 1, 1], m[s, 1, 2]
+            m20, m21, m22 = m[s, 2, 0], m[s, 2, 1], m[s, 2, 2]
             for i in range(3):
-                a, b, c = slots.mixed[s, i, 0], slots.mixed[s, i, 1], slots.mixed[s, i, 2]
-                e[s, 0, 3 + i] = -r00 * a
-                e[s, 1, 3 + i] = -(r10 * a + r11 * b)
-                e[s, 2, 3 + i] = -(r20 * a + r21 * b + r22 * c)
-            for j in range(3):
-                a, b, c = e[s, j, 3], e[s, j, 4], e[s, j, 5]
-                e[s, j, 0], e[s, j, 1], e[s, j, 2] = y * c - z * b, z * a - x * c, x * b - y * a
-            at = 6 * slots.station[s]
-            for i in range(6):
-                gradient[at + i] -= e[s, 0, i] * h0 + e[s, 1, i] * h1 + e[s, 2, i] * h2
+                if i == 0:
+                    a, b, c, h = -r00 * m00, -r00 * m10, -r00 * m20, h0
+                elif i == 1:
+                    a, b, c, h = -(r10 * m00 + r11 * m01), -(r10 * m10 + r11 * m11), -(r10 * m20 + r11 * m21), h1
+                else:
+                    a = -(r20 * m00 + r21 * m01 + r22 * m02)
+                    b = -(r20 * m10 + r21 * m11 + r22 * m12)
+                    c = -(r20 * m20 + r21 * m21 + r22 * m22)
+                    h = h2
+                k, n, o = y * c - z * b, z * a - x * c, x * b - y * a
+                e[s, i, 0], e[s, i, 1], e[s, i, 2], e[s, i, 3], e[s, i, 4], e[s, i, 5] = k, n, o, a, b, c
+                gradient[at] -= k * h
+                gradient[at + 1] -= n * h
+                gradient[at + 2] -= o * h
+                gradient[at + 3] -= a * h
+                gradient[at + 4] -= b * h
+                gradient[at + 5] -= c * h
     return 0.5 * gain
 
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import numpy as np
-
 from georef.estimation.adjustment.batches import BATCH
 from georef.estimation.adjustment.kernels import kernel, lens
 from georef.estimation.adjustment.kernels_points import loss
@@ -92,7 +90,6 @@ def _cost(tracks, begin, end, images, placed, points, cauchy, hidden_square):
         placed.cam_translation,
         placed.parameters,
     )
-    seen = np.empty(8)
     for track in range(begin, end):
         point, last, x, y, z = tracks.point[track], -1, 0.0, 0.0, 0.0
         px, py, pz = points[point, 0], points[point, 1], points[point, 2]
@@ -108,9 +105,10 @@ def _cost(tracks, begin, end, images, placed, points, cauchy, hidden_square):
             v = c[m, 1, 0] * x + c[m, 1, 1] * y + c[m, 1, 2] * z + d[m, 1]
             w = c[m, 2, 0] * x + c[m, 2, 1] * y + c[m, 2, 2] * z + d[m, 2]
             square = hidden_square
-            if lens(placed.model[row], k, row, u, v, w, seen):
-                a = (seen[0] * k[row, 0] + k[row, 2] - tracks.pixel[at, 0]) * tracks.weight[at]
-                b = (seen[1] * k[row, 1] + k[row, 3] - tracks.pixel[at, 1]) * tracks.weight[at]
+            shown, iu, iv, _, _, _, _, _, _ = lens(placed.model[row], k, row, u, v, w)
+            if shown:
+                a = (iu * k[row, 0] + k[row, 2] - tracks.pixel[at, 0]) * tracks.weight[at]
+                b = (iv * k[row, 1] + k[row, 3] - tracks.pixel[at, 1]) * tracks.weight[at]
                 square = a * a + b * b
             else:
                 hidden += 1
