@@ -68,23 +68,42 @@ def extraction(
 @benchmark.command
 def adjustment(
     *,
-    stations: Annotated[Count, Parameter(help="Stations of the simulated drive.")] = 1000,
+    stations: Annotated[
+        Count | None,
+        Parameter(help="Stations of the simulated drive; else three sizes, of 1, 2.5 and 5 million observations."),
+    ] = None,
     cameras: Annotated[Literal[5, 11], Parameter(help="Cameras of its rig.")] = 5,
     observations: Annotated[Count | None, Parameter(help="Image observations; else 200 an image.")] = None,
     calibrations: Annotated[Literal["held", "free"], Parameter(help="Interior orientations.")] = "held",
     ceres: Annotated[bool, Parameter(help="Adjust with pycolmap as well.")] = True,
     linear: Annotated[
-        Literal["direct", "as pycolmap chooses"], Parameter(help="How Ceres solves the reduced equations.")
+        Literal["direct", "iterative", "both"], Parameter(help="How Ceres solves the reduced equations.")
     ] = "direct",
+    ceres_iterations: Annotated[Count, Parameter(help="Iterations that Ceres is given at most.")] = 60,
+    picture: Annotated[Path | None, Parameter(help="PNG file: growth of time and memory.")] = None,
     scratch: Scratch = None,
     output: Output = None,
 ) -> int:
-    """The bundle adjustment of a simulated drive beside pycolmap's: CPU-seconds, memory, cost, poses."""
+    """The bundle adjustment of simulated drives beside pycolmap's: CPU-seconds, memory, cost, poses."""
     from georef.benchmarks import adjustment as bench
+    from georef.benchmarks import adjustment_report as report
     from georef.benchmarks.adjustment_problem import Size
 
-    size = Size(stations, cameras, observations or 200 * stations * cameras, calibrations == "free")
-    return _measure(lambda folder: bench.run(size, folder, linear=linear, ceres=ceres), bench.describe, scratch, output)
+    linears: tuple[Literal["direct", "iterative"], ...] = ("direct", "iterative") if linear == "both" else (linear,)
+    ways = tuple(bench.Ceres(kind, ceres_iterations) for kind in linears) if ceres else ()
+
+    def measure(folder: Path) -> dict[str, Any]:
+        if stations is None:
+            return bench.run_all(folder, ways)
+        size = Size(stations, cameras, observations or 200 * stations * cameras, calibrations == "free")
+        return bench.run(size, folder, ways)
+
+    def describe(result: dict[str, Any]) -> list[str]:
+        if picture is not None:
+            report.picture(result, picture)
+        return report.describe(result)
+
+    return _measure(measure, describe, scratch, output)
 
 
 def _measure(

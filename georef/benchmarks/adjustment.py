@@ -1,24 +1,41 @@
-"""The adjustment of a simulated drive beside pycolmap's (Ceres): the same observations, start, datum and stop."""
+"""The adjustment of simulated drives beside pycolmap's (Ceres): the same observations, start, datum and stop."""
 
 from __future__ import annotations
 
 import time
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from georef.benchmarks.adjustment_ceres import LinearSolver, Solved, solve_with_ceres
 from georef.benchmarks.adjustment_problem import TRUTH_FILE, Size, image_cost, read_problem, write_problem
-from georef.benchmarks.measure import Cost, measured, table
+from georef.benchmarks.measure import Cost, measured
 from georef.estimation.adjustment.block import Block, State
 from georef.geometry.poses import Poses
 from georef.geometry.rigid import Array
 
+if TYPE_CHECKING:
+    from georef.estimation.adjustment.solver import SolverOptions
+
 COST_TOLERANCE, MAX_ITERATIONS = 1e-10, 60
-_OURS, _CERES = "georef", "Ceres"
+SIZES = (Size(1000, 5, 1_000_000), Size(5000, 5, 2_500_000), Size(4027, 11, 5_000_000))
+OURS = "georef"
 _WARM_UP = Size(20, 5, 1000)
+
+
+@dataclass(frozen=True)
+class Ceres:
+    """A way through Ceres: how it solves the reduced equations, and how many iterations it is given."""
+
+    linear: LinearSolver
+    most_iterations: int = MAX_ITERATIONS
+
+    @property
+    def name(self) -> str:
+        return f"Ceres, {self.linear}"
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,18 +49,16 @@ class _Found:
     cameras: Array
 
 
-def run(size: Size, folder: Path, *, linear: LinearSolver = "direct", ceres: bool = True) -> dict[str, Any]:
-    """Simulates a drive and adjusts it both ways, each step in a process of its own; arrays lie in `folder`.
+def run(size: Size, folder: Path, ceres: Iterable[Ceres] = (Ceres("direct"),)) -> dict[str, Any]:
+    """Simulates a drive and adjusts it all ways, each step in a process of its own; arrays lie in `folder`.
 
-    linear: how Ceres solves the reduced equations. ceres: False leaves pycolmap out, where memory is short.
+    Differences to Ceres are told where it converged.
     """
     simulated = measured(write_problem, folder, size)
-    ways = [_found(_OURS, measured(_solve_ours, folder, size), folder)]
-    if ceres:
-        ways.append(_found(_CERES, measured(_solve_ceres, folder, size, linear), folder))
-    block = read_problem(folder, size)
-    truth = np.load(folder / TRUTH_FILE)
-    rows = {found.way: _figures(found, block, truth) for found in ways}
+    ours = _found(OURS, measured(_solve_ours, folder, size), folder)
+    theirs = [_found(way.name, measured(_solve_ceres, folder, size, way), folder) for way in ceres]
+    block, truth = read_problem(folder, size), np.load(folder / TRUTH_FILE)
+    rows = {found.way: _figures(found, block, truth) for found in (ours, *theirs)}
     return {
         "stations": size.stations,
         "images": len(block.image_ids),
@@ -51,43 +66,29 @@ def run(size: Size, folder: Path, *, linear: LinearSolver = "direct", ceres: boo
         "observations": len(block.observations),
         "calibrations": "free" if size.free_calibrations else "held",
         "held_stations": len(size.held),
-        "linear": linear,
         "simulation": {"cpu_s": simulated.cpu_s, "peak_mb": simulated.peak_mb},
         "start_cost": image_cost(block, block.start()),
         "ways": rows,
-        "between": _between(*ways) if ceres else None,
-        "ratios": _ratios(rows[_CERES], rows[_OURS]) if ceres else None,
+        "between": {f.way: _between(ours, f) for f in theirs if f.process.result["converged"]},
+        "ratios": {f.way: _ratios(rows[f.way], rows[OURS]) for f in theirs},
     }
 
 
-def describe(result: dict[str, Any]) -> list[str]:
-    """The table for a terminal."""
-    title = (
-        f"{result['stations']:,} stations, {result['images']:,} images, {result['points']:,} points, "
-        f"{result['observations']:,} observations; calibrations {result['calibrations']}, "
-        f"{result['held_stations']} stations held, one thread; Ceres' linear solver: {result['linear']}"
-    )
-    header = ("adjustment", "iterations", "CPU-s each", "solve CPU-s", "setup CPU-s", "peak MB", "cost", "RMSE mm")
-    rows = []
-    for name, way in result["ways"].items():
-        seconds = (f"{way[key]:,.2f}" for key in ("iteration_s", "solve_s", "setup_s"))
-        stop = "" if way["converged"] else " (not converged)"
-        figures = (f"{way['peak_mb']:,.0f}", f"{way['cost']:.3f}", f"{1e3 * way['rmse_m']:.3f}")
-        rows.append((name, f"{way['iterations']}{stop}", *seconds, *figures))
-    lines = [title, "", *table(header, rows)]
-    if result["between"] is None:
-        return lines
-    between, ratios = result["between"], result["ratios"]
-    lines += [
-        "",
-        f"largest difference of poses {1e3 * between['position_m']:.4f} mm, {between['rotation_deg']:.2g} degrees",
-        f"Ceres over georef: {ratios['iteration']:.1f} an iteration, {ratios['solve']:.1f} the solve, "
-        f"{ratios['total']:.1f} with setup, {ratios['memory']:.1f} memory",
-    ]
-    return lines
+def run_all(folder: Path, ceres: Iterable[Ceres], sizes: Iterable[Size] = SIZES) -> dict[str, Any]:
+    """Several sizes one after the other, and how costs grow with them."""
+    found = []
+    for number, size in enumerate(sizes):
+        here = folder / f"size_{number}"
+        here.mkdir()
+        found.append(run(size, here, ceres))
+        for file in here.rglob("*.np[yz]"):
+            file.unlink()  # gigabytes that the next size may need
+    return {"sizes": found}
 
 
 def _solve_ours(folder: Path, size: Size) -> dict[str, Any]:
+    from georef.benchmarks.adjustment_parts import TimedEquations
+    from georef.estimation.adjustment.equations import BlockEquations
     from georef.estimation.adjustment.prepared import Prepared
     from georef.estimation.adjustment.solver import SolverOptions, solve_block
 
@@ -96,28 +97,40 @@ def _solve_ours(folder: Path, size: Size) -> dict[str, Any]:
     block = read_problem(folder, size)
     begin = time.process_time()
     prepared = Prepared.of(block)
+    assert prepared.pattern.stations == size.stations
+    equations = TimedEquations(BlockEquations(block, prepared=prepared))
     ready = time.process_time()
-    done = solve_block(block, options=options, prepared=prepared)
+    done = solve_block(block, options=options, equations=equations)
     solved = time.process_time()
     found = Solved(done.state, done.iterations, ready - begin, solved - ready, done.converged)
-    return _kept(_OURS, found, folder)
+    each = max(done.iterations, 1)
+    return _kept(OURS, found, folder) | {
+        "points_s": equations.points_s / each,
+        "reduced_s": (solved - ready - equations.points_s) / each,
+    }
 
 
-def _warm_up(folder: Path, size: Size, options: Any) -> None:
+def _warm_up(folder: Path, size: Size, options: SolverOptions) -> None:
     """Compiles what is compiled, or loads it, with a small problem of the same kind."""
+    from georef.estimation.adjustment.eliminate import normal_equations
+    from georef.estimation.adjustment.prepared import Prepared
+    from georef.estimation.adjustment.reduced_solve import product
     from georef.estimation.adjustment.solver import solve_block
 
     small = folder / "warm_up"
     small.mkdir(exist_ok=True)
     alike = replace(_WARM_UP, cameras=size.cameras, free_calibrations=size.free_calibrations)
     write_problem(small, alike)
-    solve_block(read_problem(small, alike), options=replace(options, max_iterations=2))
+    block = read_problem(small, alike)
+    prepared = Prepared.of(block)
+    solve_block(block, options=replace(options, max_iterations=2), prepared=prepared)
+    product(normal_equations(block, block.start(), prepared=prepared).reduced, np.zeros(prepared.layout.size))
 
 
-def _solve_ceres(folder: Path, size: Size, linear: LinearSolver) -> dict[str, Any]:
+def _solve_ceres(folder: Path, size: Size, way: Ceres) -> dict[str, Any]:
     block = read_problem(folder, size)
-    limits = {"max_iterations": MAX_ITERATIONS, "cost_tolerance": COST_TOLERANCE}
-    return _kept(_CERES, solve_with_ceres(block, size, **limits, linear=linear), folder)
+    limits = {"max_iterations": way.most_iterations, "cost_tolerance": COST_TOLERANCE}
+    return _kept(way.name, solve_with_ceres(block, size, **limits, linear=way.linear), folder)
 
 
 def _kept(way: str, solved: Solved, folder: Path) -> dict[str, Any]:

@@ -17,7 +17,9 @@ from georef.geometry.rigid import Rigid3
 if TYPE_CHECKING:
     import pycolmap
 
-LinearSolver = Literal["direct", "as pycolmap chooses"]
+LinearSolver = Literal["direct", "iterative"]
+"""Of the reduced equations: a sparse factor of the Schur complement, or conjugate gradients with its blocks of single
+stations as preconditioner."""
 _MODELS = {"brown": "RADIAL", "fisheye": "RADIAL_FISHEYE"}  # f, cx, cy, k1, k2
 _RIG = 1
 
@@ -52,7 +54,7 @@ def solve_with_ceres(
     ready = time.process_time()
     done = cast("pycolmap.CeresBundleAdjustmentSummary", adjuster.solve()).ceres_summary
     solved = time.process_time()
-    iterations = done.num_successful_steps + done.num_unsuccessful_steps
+    iterations = done.num_successful_steps + done.num_unsuccessful_steps - 1  # the start counts as a step
     converged = done.termination_type.name == "CONVERGENCE"
     return Solved(_state(block, model), iterations, ready - begin, solved - ready, converged)
 
@@ -67,9 +69,11 @@ def _options(
     options.refine_focal_length = options.refine_principal_point = options.refine_extra_params = size.free_calibrations
     solver = options.ceres.solver_options
     solver.num_threads, solver.max_num_iterations, solver.function_tolerance = 1, max_iterations, tolerance
-    if linear == "direct":
-        options.ceres.auto_select_solver_type = False
-        solver.linear_solver_type = type(solver.linear_solver_type).SPARSE_SCHUR
+    options.ceres.auto_select_solver_type = False
+    kind, preconditioner = type(solver.linear_solver_type), type(solver.preconditioner_type)
+    solver.linear_solver_type = kind.SPARSE_SCHUR if linear == "direct" else kind.ITERATIVE_SCHUR
+    if linear == "iterative":
+        solver.preconditioner_type = preconditioner.SCHUR_JACOBI
     return options
 
 

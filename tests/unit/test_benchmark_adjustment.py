@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from georef.benchmarks import adjustment
+from georef.benchmarks import adjustment, adjustment_report
+from georef.benchmarks.adjustment import Ceres
 from georef.benchmarks.adjustment_problem import Size, image_cost, read_problem, write_problem
 from georef.benchmarks.measure import Cost
 from georef.cli import app
@@ -23,18 +24,32 @@ def _here(work, *arguments) -> Cost:
 @pytest.mark.parametrize(("cameras", "free"), [(5, False), (11, True)])
 def test_both_ways_find_the_same(cameras, free: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(adjustment, "measured", _here)
-    result = adjustment.run(Size(60, cameras, 30_000, free), tmp_path)
+    result = adjustment.run(Size(60, cameras, 30_000, free), tmp_path, [Ceres("direct"), Ceres("iterative", 2)])
     assert json.loads(json.dumps(result)) == result
-    ours, ceres = result["ways"]["georef"], result["ways"]["Ceres"]
+    ours, ceres = result["ways"]["georef"], result["ways"]["Ceres, direct"]
     assert ours["converged"]
     assert ceres["converged"]
     assert ours["cost"] == pytest.approx(ceres["cost"], rel=1e-6)
-    assert result["between"]["position_m"] < 1e-4
+    assert result["ways"]["Ceres, iterative"]["iterations"] <= 2
+    assert list(result["between"]) == ["Ceres, direct"]
+    assert result["between"]["Ceres, direct"]["position_m"] < 1e-4
+    assert ours["points_s"] + ours["reduced_s"] == pytest.approx(ours["iteration_s"])
     assert 1e-4 < ours["rmse_m"] < 0.01
     unknowns = 6 * (60 - result["held_stations"]) + 3 * result["points"] + (5 * cameras if free else 0)
     assert 2.0 * ours["cost"] / (2 * result["observations"] - unknowns) == pytest.approx(1.0, abs=0.03)
     assert result["start_cost"] > 10.0 * ours["cost"]
-    assert sum("georef" in line for line in adjustment.describe(result)) >= 1
+    assert sum("Ceres, iterative" in line for line in adjustment_report.describe(result)) == 2
+
+
+def test_several_sizes_and_how_they_grow(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(adjustment, "measured", _here)
+    result = adjustment.run_all(tmp_path, (), (Size(20, 5, 4000), Size(40, 5, 8000)))
+    assert [one["stations"] for one in result["sizes"]] == [20, 40]
+    assert not list(tmp_path.rglob("*.npz"))
+    lines = adjustment_report.describe(result)
+    assert sum("power that georef grows with" in line for line in lines) == 1
+    adjustment_report.picture(result, tmp_path / "growth.png")
+    assert (tmp_path / "growth.png").read_bytes()[:4] == b"\x89PNG"
 
 
 def test_a_problem_comes_back_from_its_file(tmp_path: Path) -> None:

@@ -58,20 +58,22 @@ class ReducedFactor:
 
 
 class StepSolver:
-    """Steps of one adjustment, iteration by iteration."""
+    """Steps of one adjustment, iteration by iteration.
+
+    most_steps: of conjugate gradients, before a factor is made after all.
+    """
 
     def __init__(self, pattern: Pattern) -> None:
-        self._pattern, self._factor, self._regular = pattern, None, False
-        self._most_steps = int(_WORTH * (pattern.factor_work / _FACTOR_RATE) / (pattern.solve_work / _SOLVE_RATE))
-
-    _factor: ReducedFactor | None
-    _regular: bool  # whether the kept factor is one without damping, which says that the solution is unique
+        self._pattern = pattern
+        self._factor: ReducedFactor | None = None
+        self._regular = False  # whether the kept factor is one without damping, which says that the solution is unique
+        self.most_steps = int(_WORTH * (pattern.factor_work / _FACTOR_RATE) / (pattern.solve_work / _SOLVE_RATE))
 
     def step(self, reduced: Reduced, added: Array) -> Array:
         """The step (6 S + B,) that solves (N + diag(added)) step = -gradient. Raises SingularMatrix."""
         damped = bool(added.any())
-        if self._factor is not None and (damped or self._regular) and self._most_steps >= _FEWEST_STEPS:
-            found = conjugate_gradients(reduced, added, -reduced.gradient, self._factor, self._most_steps)
+        if self._factor is not None and (damped or self._regular) and self.most_steps >= _FEWEST_STEPS:
+            found = conjugate_gradients(reduced, added, -reduced.gradient, self._factor, self.most_steps)
             if found is not None:
                 return found
         self._factor = None  # its memory is free for the next
