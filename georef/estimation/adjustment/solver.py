@@ -9,7 +9,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
@@ -64,6 +64,7 @@ class Iteration:
     cost: float
     step: float  # largest, m, rad and units of Camera.changed
     damping: float
+    next_damping: float  # what the next iteration begins with
 
 
 @dataclass(frozen=True)
@@ -98,6 +99,21 @@ def solve_block(
     """
     solver = _Solver(block, losses or {}, options or SolverOptions(), prepared or Prepared.of(block))
     return solver.run(start or block.start(), on_iteration)
+
+
+class Solve(Protocol):
+    """Whoever solves a block as `solve_block` does: resumed, or over several processes."""
+
+    def __call__(
+        self,
+        block: Block,
+        *,
+        losses: Losses | None = None,
+        options: SolverOptions | None = None,
+        start: State | None = None,
+        prepared: Prepared | None = None,
+        on_iteration: Callable[[Iteration], None] | None = None,
+    ) -> BlockSolution: ...
 
 
 class _Trial(NamedTuple):
@@ -135,7 +151,7 @@ class _Solver:
             damping = 0.0 if small and not self._options.free_gauge else self._relaxed(used, trial.ratio)
             _log.info("iteration %d: cost %.6g, largest step %.2g, damping %.1g", number, cost, largest, used)
             if on_iteration:
-                on_iteration(Iteration(number, state, cost, largest, used))
+                on_iteration(Iteration(number, state, cost, largest, used, damping))
             if converged or number >= self._options.max_iterations:
                 return BlockSolution(state, cost, number, converged, trial.hidden, lin.undetermined)
             lin = self._linearized(state, damping)
