@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -11,10 +12,12 @@ from numpy.typing import NDArray
 
 from georef.config import AdjustConfig
 from georef.estimation.adjustment.adjust_block import AdjustedBlock, BlockOptions, adjust_block
+from georef.estimation.adjustment.checkpoints import Resumable
 from georef.estimation.adjustment.image_covariances import image_covariances
 from georef.estimation.adjustment.solver import SolverOptions
-from georef.estimation.epoch_problem import epoch_problem, match_new_images, tie_pairs
-from georef.estimation.guided import PosedFeatures
+from georef.estimation.epoch_problem import epoch_problem, tie_pairs
+from georef.estimation.guided import Bearings, PosedFeatures
+from georef.estimation.tracks import PairMatches
 from georef.geometry.rigid import Array, Rigid3
 from georef.io.items import read_item, write_item
 from georef.stages.adjustment_report import adjustment_data, adjustment_line, all_reliability, scene_points
@@ -22,10 +25,13 @@ from georef.stages.adjustment_tables import write_tables
 from georef.stages.base import StageContext, StageSummary, feature_id, open_features
 from georef.stages.epoch_block import epoch_block
 from georef.stages.localize import make_task
+from georef.stages.solve_files import SolveFiles
 from georef.stages.stations import final_outcomes
+from georef.stages.tie_matches import TieImage, matched_pairs
+from georef.types.campaign import Image
 from georef.types.results import Localized, with_estimated_cameras
 
-RESULT = "adjusted.npz"
+RESULT, SOLVES, TIES = "adjusted.npz", "solves", "ties"
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,28 +66,39 @@ def run(context: StageContext) -> StageSummary:
     if not localized:
         write_item(context.folder / RESULT, {"image_ids": [], "data": {}}, _arrays(None, np.zeros((0, 3), np.uint8)))
         return StageSummary("no image was localized; nothing to adjust")
-    store = open_features(context.before["store"])
     images = [epoch[o.image_id] for o in localized]
-    posed = [
-        PosedFeatures.of(store.read(feature_id(image, o.quarter_turns)), image.camera, o.world_from_cam)
-        for image, o in zip(images, localized, strict=True)
-    ]
+    posed = _placed_keypoints(context, images, localized)
     task = make_task(context)
-    reference = task.map
-    ties = []
+    ties: list[PairMatches] = []
+    matched = 0
     if config.adjust.tie_points:
         pairs = tie_pairs(posed, localized, config.adjust.tie_neighbours)
-        keypoints, gate = config.matching.max_keypoints, config.localize.guided_gate
-        ties = match_new_images(posed, localized, pairs, task.matcher, keypoints, gate, context.executor.progress)
-    problem = epoch_problem(images, localized, posed, ties, reference, context.survey.control, config.adjust)
+        seen = [TieImage.of(image, outcome) for image, outcome in zip(images, localized, strict=True)]
+        ties, matched = matched_pairs(task, seen, pairs, context.folder.parent / TIES, context.executor)
+    problem = epoch_problem(images, localized, posed, ties, task.map, context.survey.control, config.adjust)
     given, before = epoch_block(context, images, localized, problem)
-    adjusted = adjust_block(given, options_of(config.adjust))
+    solves = SolveFiles(context.folder / SOLVES)
+    adjusted = adjust_block(given, options_of(config.adjust), Resumable(solves))
     checked = all_reliability(adjusted, context.survey.world)
-    data = adjustment_data(given, adjusted, checked) | before
+    data = adjustment_data(given, adjusted, checked) | before | {"pairs_matched": matched}
     write_tables(context.folder, adjusted, checked, context.survey.world)
     arrays = _arrays(adjusted, _colors(adjusted, posed))
     write_item(context.folder / RESULT, {"image_ids": list(given.image_ids), "data": data}, arrays)
+    solves.clear()
     return StageSummary(adjustment_line(data), data, len(localized), len(localized))
+
+
+def _placed_keypoints(
+    context: StageContext, images: Sequence[Image], localized: Sequence[Localized]
+) -> list[PosedFeatures]:
+    """Where the keypoints of all images are; without descriptors and rays, which matching alone needs, pair by pair."""
+    store, out = open_features(context.before["store"]), []
+    for image, outcome in zip(images, localized, strict=True):
+        features = store.read(feature_id(image, outcome.quarter_turns))
+        plain = replace(features, descriptors=np.zeros((len(features), 0), features.descriptors.dtype))
+        rays = Bearings(np.zeros((0, 3)), np.zeros((0, 3, 2)))
+        out.append(PosedFeatures(plain, image.camera, outcome.world_from_cam, rays))
+    return out
 
 
 def options_of(config: AdjustConfig) -> BlockOptions:
