@@ -12,12 +12,15 @@ from numpy.typing import NDArray
 
 from georef.config import AdjustConfig
 from georef.estimation.adjustment.adjust_block import AdjustedBlock, BlockOptions, adjust_block
+from georef.estimation.adjustment.block import Block
 from georef.estimation.adjustment.checkpoints import Resumable
 from georef.estimation.adjustment.image_covariances import image_covariances
-from georef.estimation.adjustment.solver import SolverOptions
+from georef.estimation.adjustment.partitioned import Partitioned
+from georef.estimation.adjustment.solver import Solve, SolverOptions, solve_block
 from georef.estimation.epoch_problem import epoch_problem, tie_pairs
 from georef.estimation.guided import Bearings, PosedFeatures
 from georef.estimation.tracks import PairMatches
+from georef.executor import Held
 from georef.geometry.rigid import Array, Rigid3
 from georef.io.items import read_item, write_item
 from georef.stages.adjustment_report import adjustment_data, adjustment_line, all_reliability, scene_points
@@ -31,6 +34,7 @@ from georef.stages.tie_matches import TieImage, matched_pairs
 from georef.types.campaign import Image
 from georef.types.results import Localized, with_estimated_cameras
 
+_WORTH_PARTS = 200_000  # observations
 RESULT, SOLVES, TIES = "adjusted.npz", "solves", "ties"
 
 
@@ -78,7 +82,9 @@ def run(context: StageContext) -> StageSummary:
     problem = epoch_problem(images, localized, posed, ties, task.map, context.survey.control, config.adjust)
     given, before = epoch_block(context, images, localized, problem)
     solves = SolveFiles(context.folder / SOLVES)
-    adjusted = adjust_block(given, options_of(config.adjust), Resumable(solves))
+    with context.executor.held() as held:
+        solve = solve_in(held, context.executor.workers, given)
+        adjusted = adjust_block(given, options_of(config.adjust), solve=Resumable(solves, solve))
     checked = all_reliability(adjusted, context.survey.world)
     data = adjustment_data(given, adjusted, checked) | before | {"pairs_matched": matched}
     write_tables(context.folder, adjusted, checked, context.survey.world)
@@ -99,6 +105,11 @@ def _placed_keypoints(
         rays = Bearings(np.zeros((0, 3)), np.zeros((0, 3, 2)))
         out.append(PosedFeatures(plain, image.camera, outcome.world_from_cam, rays))
     return out
+
+
+def solve_in(held: Held, workers: int, block: Block) -> Solve:
+    """How a block is solved: by all workers where it is large enough to be worth their start."""
+    return Partitioned(held, workers) if workers > 1 and len(block.observations) >= _WORTH_PARTS else solve_block
 
 
 def options_of(config: AdjustConfig) -> BlockOptions:

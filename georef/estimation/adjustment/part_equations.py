@@ -17,6 +17,7 @@ from georef.estimation.adjustment.eliminate import Linearized, Losses
 from georef.estimation.adjustment.equations import BlockEquations, Moved
 from georef.estimation.adjustment.partition import Part
 from georef.estimation.adjustment.reduced import Reduced
+from georef.estimation.adjustment.reduced_solve import _half_solved
 from georef.geometry.rigid import Array
 
 
@@ -53,7 +54,7 @@ class PartEquations:
     def __init__(self, part: Part, losses: Losses) -> None:
         self._part, self._equations = part, BlockEquations(part.block, losses)
         self._split: _Split | None = None
-        self._solved: Array = np.zeros((0, 0))
+        self._inside: tuple[BlockCholesky, Array, Array] | None = None  # factor, coupling, gradient of what is inside
         self._points, self._after = part.block.points, part.block.points
         self._state: State = part.block.start()
         self._damping = 0.0
@@ -74,18 +75,23 @@ class PartEquations:
         inside, across, matrix = split.taken(lin.reduced, self._damping * lin.diagonal[:inner])
         gradient = lin.reduced.gradient
         rest = lin.diagonal[inner:], lin.cost, lin.hidden, lin.undetermined
-        right = np.concatenate([across, gradient[:inner, None]], axis=1)
+        self._inside = None  # its memory is free for the next
+        if not inner:
+            return Condensed(matrix, gradient, *rest)
         try:
-            self._solved = BlockCholesky.of(split.pattern, inside).solve(right) if inner else right
+            factor = BlockCholesky.of(split.pattern, inside)
         except SingularMatrix as error:
             return Condensed(matrix, gradient[inner:], *rest, singular=error.unknown)
-        taken = across.T @ self._solved
-        condensed = matrix - 0.5 * (taken[:, :-1] + taken[:, :-1].T)
-        return Condensed(condensed, gradient[inner:] - taken[:, -1], *rest)
+        self._inside = factor, across, gradient[:inner]
+        half = _half_solved(factor, np.concatenate([across, gradient[:inner, None]], axis=1))
+        return Condensed(matrix - half[:, :-1].T @ half[:, :-1], gradient[inner:] - half[:, :-1].T @ half[:, -1], *rest)
 
     def moved(self, shared: Array) -> tuple[Array, Array, Moved]:
         """The part's own step (6 I,), its points, and what a step of the shared unknowns (6 J + B,) leads to."""
-        own = -(self._solved[:, -1] + self._solved[:, :-1] @ shared)
+        own = np.zeros(0)
+        if self._inside is not None:
+            factor, across, gradient = self._inside
+            own = -factor.solve(gradient + across @ shared)
         moved = self._equations.moved(self._state, np.concatenate([own, shared]), self._damping)
         self._after = moved.state.points
         return own, self._after, moved

@@ -1,9 +1,9 @@
 """A block cut into parts by space: stations inside of a part share no point with those inside of another.
 
-Stations are split at medians along the longer axis, again and again. A point that stations of two parts see makes those
-of the lower part separators: so all that is inside of a part belongs to that part alone, its points too. Each part is a
-block by itself, with the separators that it touches and everything shared, and the sum of the normal equations of all
-parts is that of the block, exactly.
+Stations are split in two, again and again, where the fewest of them see across the cut. A point that stations of two
+parts see makes those of the lower part separators: so all that is inside of a part belongs to that part alone, its
+points too. Each part is a block by itself, with the separators that it touches and everything shared; the sum of the
+normal equations of all parts is that of the block, exactly.
 """
 
 from __future__ import annotations
@@ -16,6 +16,8 @@ from numpy.typing import NDArray
 from georef.estimation.adjustment.block import Block, Indices, State
 from georef.geometry.poses import Poses
 from georef.geometry.rigid import Array
+
+_UNEVEN = 0.12  # by how much the share of a part may be off
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,34 +57,88 @@ def partition(block: Block, parts: int, positions: Array) -> Partition:
     """Splits the stations, at positions (S, 3), into parts of about equal numbers of observations."""
     obs, stations = block.observations, len(block.station_ids)
     load = np.bincount(block.station[obs.view], minlength=stations) + 1
-    part = np.zeros(stations, np.int64)
-    _split(np.arange(stations), parts, 0, positions, load, part)
     shared = np.zeros(len(block.points), bool)
     shared[block.distances.a] = shared[block.distances.b] = True
-    seen_by = block.station[obs.view]
-    of_point = np.zeros(len(block.points), np.int64)
-    np.maximum.at(of_point, obs.point, part[seen_by])
+    point, station = _incidence(block, shared)
+    part = np.zeros(stations, np.int64)
+    _split(np.arange(stations), parts, 0, positions, load, (point, station), part)
+    highest = np.zeros(len(block.points) + len(block.relative_poses), np.int64)
+    np.maximum.at(highest, point, part[station])
     separator = np.zeros(stations, bool)
-    separator[seen_by[(part[seen_by] < of_point[obs.point]) & ~shared[obs.point]]] = True
-    a, b = block.relative_poses.a, block.relative_poses.b
-    separator[a[part[a] < part[b]]] = True
-    separator[b[part[b] < part[a]]] = True
-    of_point[shared] = -1
-    return Partition(parts, part, separator, of_point)
+    separator[station[part[station] < highest[point]]] = True
+    return Partition(parts, part, separator, np.where(shared, -1, highest[: len(block.points)]))
 
 
-def _split(chosen: Indices, parts: int, first: int, positions: Array, load: Indices, out: Indices) -> None:
+def _incidence(block: Block, shared: NDArray[np.bool_]) -> tuple[Indices, Indices]:
+    """Which point (n,) is seen from which station (n,), once each; measured motions as points behind the others."""
+    obs, motions, stations = block.observations, block.relative_poses, len(block.station_ids)
+    free = ~shared[obs.point]
+    seen = np.unique(obs.point[free] * stations + block.station[obs.view[free]])
+    ends = np.tile(len(block.points) + np.arange(len(motions)), 2)
+    return (
+        np.concatenate([seen // stations, ends]),
+        np.concatenate([seen % stations, motions.a, motions.b]),
+    )
+
+
+def _split(
+    chosen: Indices,
+    parts: int,
+    first: int,
+    positions: Array,
+    load: Indices,
+    incidence: tuple[Indices, Indices],
+    out: Indices,
+) -> None:
     """Numbers the chosen stations with parts first, first + 1, ..."""
     out[chosen] = first
     if parts < 2 or len(chosen) < 2:
         return
-    axis = int(np.argmax(np.ptp(positions[chosen], axis=0)))
-    along = chosen[np.argsort(positions[chosen, axis], kind="stable")]
-    left = parts // 2
-    reached = np.cumsum(load[along])
-    cut = int(np.clip(np.searchsorted(reached, reached[-1] * left / parts), 1, len(along) - 1))
-    _split(along[:cut], left, first, positions, load, out)
-    _split(along[cut:], parts - left, first + left, positions, load, out)
+    lower = parts // 2
+    left = _lower_side(chosen, lower / parts, positions, load, incidence)
+    rest = np.setdiff1d(chosen, left)
+    side = np.zeros(len(positions), bool)
+    side[left] = True
+    for stations, count, begin, kept in (
+        (left, lower, first, side[incidence[1]]),
+        (rest, parts - lower, first + lower, ~side[incidence[1]]),
+    ):
+        _split(stations, count, begin, positions, load, (incidence[0][kept], incidence[1][kept]), out)
+
+
+def _lower_side(
+    chosen: Indices, share: float, positions: Array, load: Indices, incidence: tuple[Indices, Indices]
+) -> Indices:
+    """The stations on one side of the cut with the fewest separators, of cuts across eight directions and the order of
+    the stations, in both senses, near the asked share of the observations."""
+    best, fewest = chosen[:1], len(chosen) + 1
+    for angle in (None, *np.arange(4) * np.pi / 4):
+        key = chosen if angle is None else positions[chosen, :2] @ [np.cos(angle), np.sin(angle)]
+        along = chosen[np.argsort(key, kind="stable")]
+        for order in (along, along[::-1]):
+            reached = np.cumsum(load[order]) / load[order].sum()
+            count = _separators(order, len(positions), incidence)
+            allowed = (reached > share - _UNEVEN) & (reached < share + _UNEVEN)
+            allowed[-1] = False
+            cut = int(np.argmin(np.where(allowed, count, len(chosen))))
+            if allowed.any() and count[cut] < fewest:
+                best, fewest = order[: cut + 1], int(count[cut])
+    return np.sort(best)
+
+
+def _separators(order: Indices, stations: int, incidence: tuple[Indices, Indices]) -> Indices:
+    """How many stations (n,) up to each place of an order share a point with later ones."""
+    point, station = incidence
+    place = np.empty(stations, np.int64)
+    place[order] = np.arange(len(order))
+    last = np.zeros(int(point.max(initial=0)) + 1, np.int64)
+    np.maximum.at(last, point, place[station])
+    reach = np.zeros(len(order), np.int64)
+    np.maximum.at(reach, place[station], last[point])
+    change = np.zeros(len(order) + 1, np.int64)
+    np.add.at(change, np.arange(len(order)), 1)
+    np.add.at(change, np.maximum(reach, np.arange(len(order))), -1)
+    return np.cumsum(change)[:-1]
 
 
 def part_of(block: Block, cut: Partition, index: int) -> Part:
