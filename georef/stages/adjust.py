@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -11,33 +12,30 @@ from numpy.typing import NDArray
 
 from georef.config import AdjustConfig
 from georef.estimation.adjustment.adjust_block import AdjustedBlock, BlockOptions, adjust_block
-from georef.estimation.adjustment.block import KINDS_OF_POINT, KINDS_OF_POSE, Block
-from georef.estimation.adjustment.coherent import CoherentBlock
-from georef.estimation.adjustment.components import Component
-from georef.estimation.adjustment.constraint_terms import POSITION_PRIORS
-from georef.estimation.adjustment.eliminate import IMAGE_OBSERVATIONS
-from georef.estimation.adjustment.from_problem import Exposure, block_of
+from georef.estimation.adjustment.block import Block
+from georef.estimation.adjustment.checkpoints import Resumable
 from georef.estimation.adjustment.image_covariances import image_covariances
-from georef.estimation.adjustment.solver import SolverOptions
-from georef.estimation.epoch_problem import epoch_problem, match_new_images, tie_pairs
-from georef.estimation.guided import PosedFeatures
+from georef.estimation.adjustment.partitioned import Partitioned
+from georef.estimation.adjustment.solver import Solve, SolverOptions, solve_block
+from georef.estimation.epoch_problem import epoch_problem, tie_pairs
+from georef.estimation.guided import Bearings, PosedFeatures
+from georef.estimation.tracks import PairMatches
+from georef.executor import Held
 from georef.geometry.rigid import Array, Rigid3
 from georef.io.items import read_item, write_item
+from georef.stages.adjustment_report import adjustment_data, adjustment_line, all_reliability, scene_points
+from georef.stages.adjustment_tables import write_tables
 from georef.stages.base import StageContext, StageSummary, feature_id, open_features
+from georef.stages.epoch_block import epoch_block
 from georef.stages.localize import make_task
+from georef.stages.solve_files import SolveFiles
 from georef.stages.stations import final_outcomes
-from georef.types.campaign import Campaign, Image
+from georef.stages.tie_matches import TieImage, matched_pairs
+from georef.types.campaign import Image
 from georef.types.results import Localized, with_estimated_cameras
 
-RESULT = "adjusted.npz"
-GROUPS = {
-    IMAGE_OBSERVATIONS: "image_observations",
-    "automatic": "automatic_gcps",
-    "localized": "pose_priors",
-    POSITION_PRIORS: "gnss",
-    "control": "control_points",
-}
-"""Names in reports of what a block calls its groups of observations."""
+_WORTH_PARTS = 200_000  # observations
+RESULT, SOLVES, TIES = "adjusted.npz", "solves", "ties"
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,32 +70,46 @@ def run(context: StageContext) -> StageSummary:
     if not localized:
         write_item(context.folder / RESULT, {"image_ids": [], "data": {}}, _arrays(None, np.zeros((0, 3), np.uint8)))
         return StageSummary("no image was localized; nothing to adjust")
-    store = open_features(context.before["store"])
     images = [epoch[o.image_id] for o in localized]
-    posed = [
-        PosedFeatures.of(store.read(feature_id(image, o.quarter_turns)), image.camera, o.world_from_cam)
-        for image, o in zip(images, localized, strict=True)
-    ]
+    posed = _placed_keypoints(context, images, localized)
     task = make_task(context)
-    reference = task.map
-    ties = []
+    ties: list[PairMatches] = []
+    matched = 0
     if config.adjust.tie_points:
         pairs = tie_pairs(posed, localized, config.adjust.tie_neighbours)
-        keypoints, gate = config.matching.max_keypoints, config.localize.guided_gate
-        ties = match_new_images(posed, localized, pairs, task.matcher, keypoints, gate, context.executor.progress)
-    problem = epoch_problem(images, localized, posed, ties, reference, context.survey.control, config.adjust)
-    given = block_of(problem, [exposure_of(image, context.survey.epoch) for image in images])
-    adjusted = adjust_block(given, options_of(config.adjust))
-    data = _data(given, adjusted)
+        seen = [TieImage.of(image, outcome) for image, outcome in zip(images, localized, strict=True)]
+        ties, matched = matched_pairs(task, seen, pairs, context.folder.parent / TIES, context.executor)
+    problem = epoch_problem(images, localized, posed, ties, task.map, context.survey.control, config.adjust)
+    given, before = epoch_block(context, images, localized, problem)
+    solves = SolveFiles(context.folder / SOLVES)
+    with context.executor.held() as held:
+        solve = solve_in(held, context.executor.workers, given)
+        adjusted = adjust_block(given, options_of(config.adjust), solve=Resumable(solves, solve))
+    checked = all_reliability(adjusted, context.survey.world)
+    data = adjustment_data(given, adjusted, checked) | before | {"pairs_matched": matched}
+    write_tables(context.folder, adjusted, checked, context.survey.world)
     arrays = _arrays(adjusted, _colors(adjusted, posed))
     write_item(context.folder / RESULT, {"image_ids": list(given.image_ids), "data": data}, arrays)
-    return StageSummary(_line(data), data, len(localized), len(localized))
+    solves.clear()
+    return StageSummary(adjustment_line(data), data, len(localized), len(localized))
 
 
-def exposure_of(image: Image, epoch: Campaign) -> Exposure | None:
-    """The station and mounting of an image whose rig is known."""
-    mounting = epoch.mountings.get(image.image_id)
-    return None if mounting is None or image.station is None else Exposure(image.station, mounting)
+def _placed_keypoints(
+    context: StageContext, images: Sequence[Image], localized: Sequence[Localized]
+) -> list[PosedFeatures]:
+    """Where the keypoints of all images are; without descriptors and rays, which matching alone needs, pair by pair."""
+    store, out = open_features(context.before["store"]), []
+    for image, outcome in zip(images, localized, strict=True):
+        features = store.read(feature_id(image, outcome.quarter_turns))
+        plain = replace(features, descriptors=np.zeros((len(features), 0), features.descriptors.dtype))
+        rays = Bearings(np.zeros((0, 3)), np.zeros((0, 3, 2)))
+        out.append(PosedFeatures(plain, image.camera, outcome.world_from_cam, rays))
+    return out
+
+
+def solve_in(held: Held, workers: int, block: Block) -> Solve:
+    """How a block is solved: by all workers where it is large enough to be worth their start."""
+    return Partitioned(held, workers) if workers > 1 and len(block.observations) >= _WORTH_PARTS else solve_block
 
 
 def options_of(config: AdjustConfig) -> BlockOptions:
@@ -141,20 +153,9 @@ def _arrays(adjusted: AdjustedBlock | None, colors: NDArray[np.uint8]) -> dict[s
         "poses": np.array([pose.matrix() for pose in adjusted.block.world_from_cam(state).to_list()]),
         "joint_cov": joint,
         "relative_joint_cov": relative,
-        "points": state.points[_scene_points(adjusted)],
+        "points": state.points[scene_points(adjusted)],
         "colors": colors,
     }
-
-
-def _scene_points(adjusted: AdjustedBlock) -> NDArray[np.int64]:
-    """Tie points and automatic GCPs that the adjustment determined."""
-    determined = np.flatnonzero(np.isfinite(adjusted.quality.images.points).all(axis=(1, 2)))
-    return np.setdiff1d(determined, _points_of(adjusted.block, "control"))
-
-
-def _points_of(block: Block, kind: str) -> NDArray[np.int64]:
-    priors = block.point_priors
-    return priors.point[priors.kind == KINDS_OF_POINT.index(kind)]
 
 
 def _colors(adjusted: AdjustedBlock, posed: list[PosedFeatures]) -> NDArray[np.uint8]:
@@ -164,113 +165,4 @@ def _colors(adjusted: AdjustedBlock, posed: list[PosedFeatures]) -> NDArray[np.u
     for index, image in enumerate(posed):
         here = (obs.view == index) & (obs.keypoint >= 0)
         colors[obs.point[here]] = image.features.colors_rgb[obs.keypoint[here]]
-    return colors[_scene_points(adjusted)]
-
-
-def _data(given: Block, adjusted: AdjustedBlock) -> dict[str, Any]:
-    block, solution = adjusted.block, adjusted.solution
-    in_gcps = len(_points_of(block, "automatic"))
-    return {
-        "images": len(block.image_ids),
-        "stations": len(block.station_ids),
-        "automatic_gcps": in_gcps,
-        "tie_points": len(_scene_points(adjusted)) - in_gcps,
-        "image_observations": len(block.observations),
-        "gnss_positions": len(block.position_priors),
-        "pose_priors": len(block.pose_priors),
-        "gates": _gates(given, adjusted),
-        "coherent_blocks": [_coherent(wrong) for wrong in adjusted.wrong],
-        "undecidable": adjusted.undecidable,
-        "variance_components": {
-            GROUPS[name]: component_data(c) for name, c in adjusted.quality.components.items() if name in GROUPS
-        },
-        "image_sigma_scale": adjusted.sigma_scale,
-        "iterations": solution.iterations,
-        "converged": solution.converged,
-        "images_used": _per_image(adjusted),
-        "control": _control(given, adjusted),
-    }
-
-
-def _gates(given: Block, adjusted: AdjustedBlock) -> dict[str, Any]:
-    """How many of each group were tested, and which were rejected; of automatic GCPs the number alone."""
-    kinds = np.array(KINDS_OF_POINT)[given.point_priors.kind]
-    tested = {
-        IMAGE_OBSERVATIONS: len(given.observations),
-        KINDS_OF_POSE[0]: len(given.pose_priors),
-        POSITION_PRIORS: len(given.position_priors),
-        **{kind: int((kinds == kind).sum()) for kind in KINDS_OF_POINT},
-    }
-    names = {kind: [r.name for r in adjusted.rejected if r.kind == kind] for kind in tested}
-    rejected = {kind: len(found) for kind, found in names.items()} | {IMAGE_OBSERVATIONS: adjusted.dropped}
-    names["automatic"] = []
-    return {
-        GROUPS[kind]: {"tested": count, "rejected": rejected[kind], "rejected_ids": names[kind]}
-        for kind, count in tested.items()
-    }
-
-
-def _coherent(wrong: CoherentBlock) -> dict[str, Any]:
-    """Neighbouring stations whose localized poses are off by one shift: given minus adjusted, world axes."""
-    return {
-        "stations": list(wrong.station_ids),
-        "shift_m": wrong.shift_m.tolist(),
-        "sigma_m": np.sqrt(np.diag(wrong.cov)).tolist(),
-        "statistic": wrong.statistic,
-    }
-
-
-def component_data(component: Component) -> dict[str, Any]:
-    return {
-        "observations": component.observations,
-        "redundancy": component.redundancy,
-        "factor": component.factor,
-        "factor_sigma": component.factor_sigma,
-    }
-
-
-def _per_image(adjusted: AdjustedBlock) -> dict[str, Any]:
-    """Number of observations, residual RMS in pixels and offset from GNSS of each image."""
-    block, state = adjusted.block, adjusted.solution.state
-    obs = block.observations
-    square = np.square(block.views(state).project(obs.view, state.points[obs.point]) - obs.pixel).mean(axis=1)
-    count = np.bincount(obs.view, minlength=len(block.image_ids))
-    total = np.bincount(obs.view, weights=square, minlength=len(count))
-    out: dict[str, Any] = {
-        name: {"observations": int(n), "residual_rms_px": float(np.sqrt(t / n)) if n else None}
-        for name, n, t in zip(block.image_ids, count, total, strict=True)
-    }
-    places = zip(block.station.tolist(), block.mounting.tolist(), strict=True)
-    image_at = dict(zip(places, block.image_ids, strict=True))
-    priors = block.position_priors
-    measured = state.world_from_rig.take(priors.station).apply(state.lever_arms_m[priors.antenna])
-    for station, mounting, offset in zip(priors.station, priors.antenna, measured - priors.position, strict=True):
-        out[image_at[int(station), int(mounting)]]["gnss_residual_m"] = offset.tolist()
-    return out
-
-
-def _control(given: Block, adjusted: AdjustedBlock) -> list[dict[str, Any]]:
-    """Residuals of the control points that took part, in world axes: estimated minus given."""
-    priors = adjusted.block.point_priors
-    marks = np.bincount(given.observations.point, minlength=len(given.points))
-    return [
-        {
-            "point": priors.point_ids[row],
-            "residual_m": (adjusted.solution.state.points[priors.point[row]] - priors.position[row]).tolist(),
-            "sigma_m": np.sqrt(np.diag(np.linalg.inv(priors.information[row]))).tolist(),
-            "images": int(marks[priors.point[row]]),
-        }
-        for row in np.flatnonzero(priors.kind == KINDS_OF_POINT.index("control"))
-    ]
-
-
-def _line(data: dict[str, Any]) -> str:
-    scale = data["variance_components"]["image_observations"]["factor"]
-    gate = data["gates"]["image_observations"]
-    return (
-        f"{data['images']} images, {data['automatic_gcps']} automatic GCPs, {data['tie_points']} tie points, "
-        f"{data['image_observations']} observations ({gate['rejected']} rejected), "
-        f"sigma0 {'-' if scale is None else f'{scale:.2f}'}"
-        + ("" if data["converged"] else ", NOT CONVERGED")
-        + (", UNDECIDABLE which localized poses are wrong" if data["undecidable"] else "")
-    )
+    return colors[scene_points(adjusted)]
