@@ -108,7 +108,7 @@ def read_outcome(path: Path) -> Outcome:
         gnss_offset_m=header["gnss_offset_m"],
         quarter_turns=header["quarter_turns"],
         **told,
-        camera=_camera(header.get("camera")),
+        camera=None if header.get("camera") is None else camera_of(header["camera"]),
         intrinsics_cov=arrays.get("intrinsics_cov"),
     )
 
@@ -118,8 +118,7 @@ def _told(outcome: Outcome) -> dict[str, Any]:
     return {"notes": outcome.notes, "cpu_s": outcome.cpu_s, "candidates": outcome.candidates}
 
 
-def _camera(stored: dict[str, Any] | None) -> Camera | None:
-    if stored is None:
-        return None
+def camera_of(stored: dict[str, Any]) -> Camera:
+    """A camera that was stored as a dictionary of its fields."""
     lists = {"distortion": tuple(stored["distortion"]), "estimate": tuple(stored["estimate"])}
     return Camera(**{**stored, **lists})

@@ -12,8 +12,8 @@ from georef.config import AdjustConfig
 from georef.estimation.adjustment.block_check import check_block, common_offset, with_points_as_control
 from georef.estimation.adjustment.block_correlations import shared_unknowns, strong_correlations
 from georef.estimation.adjustment.block_solutions import CleanBlock, Solved, clean, solve_with_control, without_offset
+from georef.estimation.adjustment.equations import moved_state
 from georef.estimation.adjustment.reduced import Layout
-from georef.estimation.adjustment.solver import moved_state
 from georef.geometry.camera import Camera
 from georef.project import open_project
 from georef.stages.block_survey import BlockSurvey, load_block

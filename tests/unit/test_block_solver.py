@@ -204,3 +204,40 @@ def _camera_names() -> set[str]:
 
 def test_all_lens_models_take_part() -> None:
     assert _camera_names() == {"pinhole", "brown", "fisheye", "rational"}
+
+
+def test_prepared_for_less_is_as_prepared_anew() -> None:
+    """Fewer observations (a point loses all of its own, a prior keeps another), fewer constraints, other sigmas."""
+    block = rig_block(2).block
+    given = block.point_priors
+    alone = np.flatnonzero(~np.isin(np.arange(len(block.points)), given.point))[3]
+    kept = np.random.default_rng(0).random(len(block.observations)) < 0.8
+    kept &= (block.observations.point != alone) & (block.observations.point != given.point[0])
+    less = replace(
+        block,
+        observations=block.observations.take(kept).scaled(1.3),
+        pose_priors=block.pose_priors.take(np.arange(len(block.pose_priors)) > 0),
+        point_priors=given.take(np.arange(len(given)) != 1),
+    )
+    whole = Prepared.of(block)
+    ordered = whole.pattern
+    found, anew = whole.restricted(less, kept), Prepared.of(less)
+    assert found.pattern is ordered
+    assert np.array_equal(found.order[np.argsort(found.order)], np.arange(len(less.observations)))
+    assert set(found.tracks.point) == set(anew.tracks.point)
+    state = _away(less, less.start(), 1e-3)
+    one, other = (normal_equations(less, state, prepared=p) for p in (found, anew))
+    scale = np.sqrt(np.diag(other.reduced.dense()))
+    assert _difference(one.reduced.dense(), other.reduced.dense(), scale) < 1e-11
+    assert (one.cost, one.undetermined) == (pytest.approx(other.cost, rel=1e-12), other.undetermined)
+    again = solve_block(less, prepared=found).state.world_from_rig
+    assert np.abs(again.local(solve_block(less).state.world_from_rig)).max() < 1e-7
+
+
+def test_prepared_for_fewer_distances_eliminates_their_ends() -> None:
+    block = rig_block(2).block
+    assert len(block.distances)
+    less = replace(block, distances=block.distances.take(np.zeros(len(block.distances), bool)))
+    found = Prepared.of(block).restricted(less)
+    assert (found.tracks.kept < 0).all()
+    assert found.layout.border == Prepared.of(less).layout.border < Prepared.of(block).layout.border

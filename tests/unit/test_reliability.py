@@ -39,7 +39,7 @@ def test_delta0() -> None:
 def test_against_the_dense_network(solved: tuple[Block, State, dict[str, TermTests]]) -> None:
     """Control points of three, two and one coordinates: everything from the one dense matrix."""
     block, state, tests = solved
-    found, dense = reliability(block, tests["control"]), equations(block, state)
+    found, dense = reliability(block, state, tests["control"]), equations(block, state)
     qvv = np.eye(len(dense.residual)) - dense.design @ dense.inverse @ dense.design.T
     for k in range(len(found.ids)):
         for axis in range(3):
@@ -67,13 +67,13 @@ def test_a_bias_of_the_detectable_size(
 ) -> None:
     """It shifts w by delta0, so that a share of 1 - beta0 fails at alpha0, and the adjusted position by the effect."""
     block, state, tests = solved
-    before = reliability(block, tests[name])
+    before = reliability(block, state, tests[name])
     k = 1
     bias: Array = np.zeros(3)
     bias[component % 3] = before.detectable[k, component]
     wrong = _shifted(block, name, tests[name].row[k], bias)
     after_state = solve_block(wrong, start=state).state
-    after = reliability(wrong, _tests(wrong, after_state)[name])
+    after = reliability(wrong, after_state, _tests(wrong, after_state)[name])
     change = after.w[k, component] - before.w[k, component]
     assert abs(change) == pytest.approx(DELTA0, rel=0.05)
     assert norm.sf(norm.ppf(0.9995) - abs(change)) == pytest.approx(0.80, abs=0.1)
@@ -115,12 +115,25 @@ def test_what_nothing_checks_has_no_detectable_bias() -> None:
         antennas=(),
     )
     state = solve_block(alone).state
-    found: Reliability = reliability(alone, _tests(alone, state)["localized"])
+    found: Reliability = reliability(alone, state, _tests(alone, state)["localized"])
     assert np.isinf(found.detectable[0, 3:]).all()
     assert (found.redundancy[0, 3:] < 0.01).all()
 
 
+def test_along_other_axes(solved: tuple[Block, State, dict[str, TermTests]]) -> None:
+    """Axes that are exchanged exchange the numbers, those of rotations as well."""
+    block, state, tests = solved
+    cycled = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]])
+    for name in ("control", POSITION_PRIORS, "localized"):
+        plain = reliability(block, state, tests[name])
+        turned = reliability(block, state, tests[name], lambda places: np.tile(cycled, (len(places), 1, 1)))
+        order = [1, 2, 0] if plain.w.shape[1] == 3 else [1, 2, 0, 4, 5, 3]
+        for part in ("residual", "redundancy", "w", "detectable", "sigma"):
+            assert getattr(turned, part) == pytest.approx(getattr(plain, part)[:, order], rel=1e-6, nan_ok=True), part
+        assert plain.place == pytest.approx(turned.place)
+
+
 def test_other_kinds_are_refused(solved: tuple[Block, State, dict[str, TermTests]]) -> None:
-    block, _, tests = solved
+    block, state, tests = solved
     with pytest.raises(KeyError, match="relative poses"):
-        reliability(block, tests[RELATIVE_POSES])
+        reliability(block, state, tests[RELATIVE_POSES])

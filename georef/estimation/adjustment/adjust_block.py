@@ -25,7 +25,7 @@ from georef.estimation.adjustment.group_tests import ImageTests, TermTests, comp
 from georef.estimation.adjustment.prepared import Prepared
 from georef.estimation.adjustment.reference_part import ReferencePart
 from georef.estimation.adjustment.shift_system import pose_shifts
-from georef.estimation.adjustment.solver import BlockSolution, SolverOptions, solve_block
+from georef.estimation.adjustment.solver import BlockSolution, Solve, SolverOptions, solve_block
 
 _GATE_ROUNDS, _ROBUST_ROUNDS = 3, 2
 _ROBUST_COST_TOLERANCE = 1e-5
@@ -81,33 +81,35 @@ class AdjustedBlock:
     sigma_scale: float
 
 
-def adjust_block(block: Block, options: BlockOptions) -> AdjustedBlock:
+def adjust_block(block: Block, options: BlockOptions, solve: Solve = solve_block) -> AdjustedBlock:
     """Adjusts a block in which observations and constraints may be wrong.
 
     Image sigmas are scaled by their own variance component; sigmas of constraints are tested and reported, never
-    changed. Raises GeorefError where the constraints leave the datum open.
+    changed. solve: how its solves are done, such as `checkpoints.Resumable`. Raises GeorefError where the constraints
+    leave the datum open.
     """
     given, gross = block, 1.0 - _GROSS * (1.0 - options.gate_probability)
-    block, state, scale, found = _robust(block, block.start(), options)
+    block, state, scale, found = _robust(block, block.start(), options, solve)
     block, _ = _gate_images(block, found, gross)
     search = _coherent(block, state, options)
     if search.blocks:
         lacking = _without_rows(block, search)
-        state = _robust_state(lacking, state, options)
+        state = _robust_state(lacking, state, options, solve)
         search = without_agreeing(search, block, state, quality(lacking, state).cofactors, options.gate_probability)
         block = _without_rows(block, search)
     block, rejected = without_contradictions(block, quality(block, state).constraints, gross)
-    solution = solve_block(block, options=options.solver, start=state)
-    block, solution, scale, found = _rescaled(block, solution, scale, quality(block, solution.state), options)
+    solution = solve(block, options=options.solver, start=state)
+    found = quality(block, solution.state)
+    block, solution, scale, found = _rescaled(block, solution, scale, found, options, solve)
     for _ in range(_GATE_ROUNDS):
         kept, more = without_contradictions(block, found.constraints, options.gate_probability)
         kept, dropped = _gate_images(kept, found, options.gate_probability)
         if not more and dropped <= _SETTLED_SHARE * len(given.observations):
             break
         block, rejected = kept, rejected + more
-        solution = solve_block(block, options=options.solver, start=solution.state)
+        solution = solve(block, options=options.solver, start=solution.state)
         found = quality(block, solution.state)
-    block, solution, scale, found = _rescaled(block, solution, scale, found, options)
+    block, solution, scale, found = _rescaled(block, solution, scale, found, options, solve)
     dropped = len(given.observations) - len(block.observations)
     return AdjustedBlock(block, solution, found, rejected, search.blocks, search.undecidable, dropped, scale)
 
@@ -134,11 +136,11 @@ def _inverted(block: Block, state: State, lin: Linearized) -> Cofactors:
         ) from None
 
 
-def _robust(block: Block, state: State, options: BlockOptions) -> tuple[Block, State, float, Quality]:
+def _robust(block: Block, state: State, options: BlockOptions, solve: Solve) -> tuple[Block, State, float, Quality]:
     """The robust solution, with image sigmas near what the residuals show: a loss far too narrow fits too few."""
     scale = 1.0
     for _ in range(1 + _ROBUST_ROUNDS):
-        state = _robust_state(block, state, options)
+        state = _robust_state(block, state, options, solve)
         found = quality(block, state)
         factor = min(max(found.images.scale, 0.1), 10.0)
         if 1.0 / _FAR_OFF < factor < _FAR_OFF:
@@ -147,10 +149,10 @@ def _robust(block: Block, state: State, options: BlockOptions) -> tuple[Block, S
     return block, state, scale, quality(block, state)
 
 
-def _robust_state(block: Block, state: State, options: BlockOptions) -> State:
+def _robust_state(block: Block, state: State, options: BlockOptions, solve: Solve) -> State:
     """The robust solution as closely as gates need it: reweighting converges slowly."""
     solver = replace(options.solver, cost_tolerance=max(options.solver.cost_tolerance, _ROBUST_COST_TOLERANCE))
-    return solve_block(block, losses=options.losses, options=solver, start=state).state
+    return solve(block, losses=options.losses, options=solver, start=state).state
 
 
 def _scaled(block: Block, factor: float) -> Block:
@@ -187,7 +189,7 @@ def _without_rows(block: Block, search: CoherentSearch) -> Block:
 
 
 def _rescaled(
-    block: Block, solution: BlockSolution, scale: float, found: Quality, options: BlockOptions
+    block: Block, solution: BlockSolution, scale: float, found: Quality, options: BlockOptions, solve: Solve
 ) -> tuple[Block, BlockSolution, float, Quality]:
     """The image sigmas brought to what the residuals show, the solution for them and its quality."""
     component = found.components.get(IMAGE_OBSERVATIONS)
@@ -195,5 +197,5 @@ def _rescaled(
     if factor is None or abs(factor - 1.0) < _FACTOR_TOLERANCE:
         return block, solution, scale, found
     block = _scaled(block, factor)
-    solution = solve_block(block, options=options.solver, start=solution.state)
+    solution = solve(block, options=options.solver, start=solution.state)
     return block, solution, scale * factor, quality(block, solution.state)

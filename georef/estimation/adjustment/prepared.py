@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from georef.estimation.adjustment.batches import Tracks, Work, work_for
 from georef.estimation.adjustment.block import Block, Indices, State
+from georef.estimation.adjustment.block_cholesky import Pattern
 from georef.estimation.adjustment.kernels import (
     ASPECT,
     CENTRE_X,
@@ -45,25 +47,63 @@ class Prepared:
     def of(block: Block) -> Prepared:
         layout = Layout.of(block)
         order, points, start = _sorted_by_point(block)
-        prior_row = np.full(len(block.points), -1)
-        prior_row[block.point_priors.point] = np.arange(len(block.point_priors))
-        obs = block.observations
-        tracks = Tracks(
-            point=points,
-            start=start,
-            image=obs.view[order].astype(np.int32),
-            pixel=obs.pixel[order],
-            weight=1.0 / obs.sigma_px[order],
-            kept=layout.kept_point[points],
-            prior=prior_row[points],
-        )
+        tracks = _tracks(block, layout, order, points, start)
         stations = block.station.astype(np.int32)
         tied = np.stack([block.relative_poses.a, block.relative_poses.b], axis=1)
         first, column = station_pairs(tracks, stations, layout, np.sort(tied, axis=1))
         return Prepared(layout, tracks, _images(block, layout), order, first, column)
 
+    @cached_property
+    def pattern(self) -> Pattern:
+        """The order in which stations are eliminated, found once for all matrices of this pattern."""
+        return Pattern.of(self.first, self.column)
+
+    def restricted(self, block: Block, kept: NDArray[np.bool_] | None = None) -> Prepared:
+        """The same for a block that lacks some of the observations or constraints: what is left is not sorted again.
+
+        kept (n,): which observations of the prepared block are left, in their order (None: all). Sigmas, and values of
+        priors, may differ. The pattern keeps pairs of stations that share nothing any more, and is not ordered again.
+        Measured distances must be as many: their ends are not eliminated; where they are fewer all is made anew.
+        """
+        layout = Layout.of(block)
+        if not np.array_equal(layout.kept_point, self.layout.kept_point):
+            return Prepared.of(block)
+        order, points, start = self.order, self.tracks.point, self.tracks.start
+        if kept is not None:
+            left = kept[order]
+            order = (np.cumsum(kept) - 1)[order[left]]
+            start = np.concatenate([[0], np.cumsum(left)])[start]
+        counts = np.diff(start)
+        needed = counts > 0
+        prior = np.zeros(len(block.points), bool)
+        prior[block.point_priors.point] = True
+        needed |= prior[points]
+        start = np.concatenate([[0], np.cumsum(counts[needed])])
+        tracks = _tracks(block, layout, order, points[needed], start)
+        out = replace(self, layout=layout, tracks=tracks, images=_images(block, layout), order=order)
+        if "pattern" in self.__dict__:
+            out.__dict__["pattern"] = self.pattern
+        return out
+
     def work(self) -> Work:
         return work_for(self.tracks.start, 6 + self.images.code.shape[1] + 3, self.layout.border)
+
+
+def _tracks(
+    block: Block, layout: Layout, order: Indices, points: NDArray[np.int32], start: NDArray[np.int64]
+) -> Tracks:
+    prior_row = np.full(len(block.points), -1)
+    prior_row[block.point_priors.point] = np.arange(len(block.point_priors))
+    obs = block.observations
+    return Tracks(
+        point=points,
+        start=start,
+        image=obs.view[order].astype(np.int32),
+        pixel=obs.pixel[order],
+        weight=1.0 / obs.sigma_px[order],
+        kept=layout.kept_point[points],
+        prior=prior_row[points],
+    )
 
 
 def placed(state: State) -> Placed:

@@ -9,32 +9,20 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
 from georef.errors import GeorefError
-from georef.estimation.adjustment.batches import Work
-from georef.estimation.adjustment.block import Block, Indices, State
-from georef.estimation.adjustment.block_cholesky import Pattern, SingularMatrix
-from georef.estimation.adjustment.eliminate import (
-    IMAGE_OBSERVATIONS,
-    GivenPoints,
-    Linearized,
-    Losses,
-    constraint_cost,
-    cost_of_squares,
-    normal_equations,
-    promised_by_constraints,
-)
-from georef.estimation.adjustment.kernels_move import move_points
-from georef.estimation.adjustment.prepared import Prepared, placed
-from georef.estimation.adjustment.reduced import Layout
+from georef.estimation.adjustment.block import Block, State
+from georef.estimation.adjustment.block_cholesky import SingularMatrix
+from georef.estimation.adjustment.eliminate import Linearized, Losses
+from georef.estimation.adjustment.equations import BlockEquations, Equations
+from georef.estimation.adjustment.prepared import Prepared
 from georef.estimation.adjustment.reduced_solve import reduced_step
 from georef.geometry.rigid import Array
 
 _log = logging.getLogger(__name__)
-_HIDDEN_SQUARE = 1e4  # what an observation costs whose point a step moves out of sight: as much as one 100 sigmas off
 _ROUNDING = 1e-11  # of the cost
 _NO_DAMPING, _HIGHEST_DAMPING, _FREE_GAUGE_DAMPING = 1e-11, 1e10, 1e-9
 
@@ -64,6 +52,7 @@ class Iteration:
     cost: float
     step: float  # largest, m, rad and units of Camera.changed
     damping: float
+    next_damping: float  # what the next iteration begins with
 
 
 @dataclass(frozen=True)
@@ -89,19 +78,36 @@ def solve_block(
     options: SolverOptions | None = None,
     start: State | None = None,
     prepared: Prepared | None = None,
+    equations: Equations | None = None,
     on_iteration: Callable[[Iteration], None] | None = None,
 ) -> BlockSolution:
     """Minimises half the squared whitened residuals of a block, with a Cauchy loss for the groups named in losses.
 
-    start: another state than the approximate values, such as the last one of an interrupted adjustment. Raises
-    GeorefError where the constraints do not determine all unknowns.
+    start: another state than the approximate values, such as the last one of an interrupted adjustment. equations: who
+    else sums the normal equations of this block, with these losses. Raises GeorefError where the constraints do not
+    determine all unknowns.
     """
-    solver = _Solver(block, losses or {}, options or SolverOptions(), prepared or Prepared.of(block))
-    return solver.run(start or block.start(), on_iteration)
+    equations = equations or BlockEquations(block, losses, prepared)
+    return _Solver(block, options or SolverOptions(), equations).run(start or block.start(), on_iteration)
+
+
+class Solve(Protocol):
+    """Whoever solves a block as `solve_block` does: resumed, or over several processes."""
+
+    def __call__(
+        self,
+        block: Block,
+        *,
+        losses: Losses | None = None,
+        options: SolverOptions | None = None,
+        start: State | None = None,
+        prepared: Prepared | None = None,
+        on_iteration: Callable[[Iteration], None] | None = None,
+    ) -> BlockSolution: ...
 
 
 class _Trial(NamedTuple):
-    """A step, where it leads, and what it did to the cost (with _HIDDEN_SQUARE for what is out of sight)."""
+    """A step, where it leads, and what it did to the cost (with HIDDEN_SQUARE for what is out of sight)."""
 
     step: Array
     state: State
@@ -111,18 +117,15 @@ class _Trial(NamedTuple):
 
 
 class _Solver:
-    """One adjustment under way: what it is given, the pattern of its equations, scratch memory."""
+    """One adjustment under way."""
 
-    def __init__(self, block: Block, losses: Losses, options: SolverOptions, prepared: Prepared) -> None:
-        self._block, self._losses, self._options, self._prepared = block, losses, options, prepared
-        self._pattern = Pattern.of(prepared.first, prepared.column)
-        self._work: Work = prepared.work()
-        self._image_scale = losses.get(IMAGE_OBSERVATIONS, 0.0)
-        self._hidden_cost = cost_of_squares(np.array([_HIDDEN_SQUARE]), self._image_scale)
+    def __init__(self, block: Block, options: SolverOptions, equations: Equations) -> None:
+        self._block, self._options, self._equations = block, options, equations
+        self._pattern, self._hidden_cost = equations.pattern, equations.hidden_cost
 
     def run(self, state: State, on_iteration: Callable[[Iteration], None] | None) -> BlockSolution:
         damping, number = self._options.damping, 0
-        lin = self._linearized(state, damping)
+        lin = self._equations.linearized(state, damping)
         while True:
             number += 1
             before = lin.cost
@@ -135,15 +138,10 @@ class _Solver:
             damping = 0.0 if small and not self._options.free_gauge else self._relaxed(used, trial.ratio)
             _log.info("iteration %d: cost %.6g, largest step %.2g, damping %.1g", number, cost, largest, used)
             if on_iteration:
-                on_iteration(Iteration(number, state, cost, largest, used))
+                on_iteration(Iteration(number, state, cost, largest, used, damping))
             if converged or number >= self._options.max_iterations:
                 return BlockSolution(state, cost, number, converged, trial.hidden, lin.undetermined)
-            lin = self._linearized(state, damping)
-
-    def _linearized(self, state: State, damping: float) -> Linearized:
-        return normal_equations(
-            *(self._block, state), losses=self._losses, damping=damping, prepared=self._prepared, work=self._work
-        )
+            lin = self._equations.linearized(state, damping)
 
     def _accepted_step(self, state: State, lin: Linearized, damping: float) -> tuple[_Trial, float, Linearized]:
         """The first step that lowers the cost, its damping, and the equations it came from."""
@@ -155,7 +153,7 @@ class _Solver:
                 return trial, damping, lin
             damping = max(damping * growth, 1e-6)
             growth *= 2.0
-            lin = self._linearized(state, damping)
+            lin = self._equations.linearized(state, damping)
         raise GeorefError(
             "The adjustment finds no step that improves it: its approximate values are too far off.",
             "Check approximate poses, units and the coordinate reference system of the constraints.",
@@ -176,52 +174,20 @@ class _Solver:
             if damping > 0.0:
                 return None
             raise self._singular(error, state, lin) from None
-        moved = moved_state(self._prepared.layout, state, step)
-        given = GivenPoints.at(self._block, state.points, self._losses)
-        promised, cost, hidden = move_points(
-            *(self._prepared.tracks, self._prepared.images, placed(state), placed(moved), state.points),
-            *(given.information, given.shift, damping, self._image_scale, _HIDDEN_SQUARE, step, moved.points),
-            self._work,
-        )
-        args = (self._prepared.layout, self._losses)
-        cost += constraint_cost(self._block, moved, *args)
-        promised += promised_by_constraints(self._block, state, step, moved.points, *args)
-        lost = abs(promised) <= _ROUNDING * before and abs(before - cost) <= _ROUNDING * before
-        ratio = 1.0 if lost else ((before - cost) / promised if promised > 0.0 else -1.0)
-        return _Trial(step, moved, float(cost), float(ratio), int(hidden))
+        moved = self._equations.moved(state, step, damping)
+        gained, promised = before - moved.cost, moved.promised
+        lost = abs(promised) <= _ROUNDING * before and abs(gained) <= _ROUNDING * before
+        ratio = 1.0 if lost else (gained / promised if promised > 0.0 else -1.0)
+        return _Trial(step, moved.state, moved.cost, float(ratio), moved.hidden)
 
     def _singular(self, error: SingularMatrix, state: State, lin: Linearized) -> GeorefError:
         """What is missing, in the words of `datum` where it finds a reason."""
         from georef.estimation.adjustment.datum import explain_singular
         from georef.estimation.adjustment.datum_words import name_of_unknown
 
-        unknown = name_of_unknown(self._block, self._prepared.layout, error.unknown)
+        unknown = name_of_unknown(self._block, self._equations.layout, error.unknown)
         return GeorefError(
             f"The adjustment has no unique solution: its observations and constraints do not fix {unknown}.",
             explain_singular(self._block, state, lin.reduced)
             or "Add control points, GNSS positions or pose priors, or hold unknowns that nothing determines.",
         )
-
-
-def moved_state(layout: Layout, state: State, step: Array) -> State:
-    """The state after a step (6 S + B,) of stations and border; points are copied, kept ones moved."""
-    stations, border = step[: 6 * layout.stations].reshape(-1, 6), step[6 * layout.stations :]
-
-    def taken(starts: Indices, size: int) -> Array:
-        out = np.zeros((len(starts), size))
-        there = np.flatnonzero(starts >= 0)
-        out[there] = border[starts[there][:, None] + np.arange(size)]
-        return out
-
-    cameras = tuple(
-        camera.changed(camera.estimate, border[at : at + len(camera.estimate)]) if at >= 0 else camera
-        for at, camera in zip(layout.calibration, state.cameras, strict=True)
-    )
-    return State(
-        state.world_from_rig.retract(stations),
-        state.rig_from_cam.retract(taken(layout.mounting, 6)),
-        cameras,
-        state.lever_arms_m + taken(layout.antenna, 3),
-        state.drift_m + taken(layout.drift, 3),
-        state.points + taken(layout.kept_point, 3),
-    )
