@@ -26,7 +26,7 @@ _FALSE_ALARM = 0.001  # of a whole search
 _RUNS_A_SEGMENT = 10.0  # so many of the runs through a segment count as independent
 _MOST_RUNS = 100
 _POWER = 0.8  # that a detectable shift is found with: 1 - beta0
-_FEWEST_POINTS = 3  # one or two that are off are single blunders
+FEWEST_POINTS = 3  # one or two that are off are single blunders
 _LARGE_SHARE = 0.5  # of those that are left: so many of one other shift may be the right ones as well
 Run = tuple[int, int]
 
@@ -37,8 +37,8 @@ class CoherentBlock:
 
     poses, points: rows of the block's priors; references: images of the reference that these points come from;
     shift_m: given minus adjusted (3,), in world, with its covariance (3, 3); statistic: chi-square with 3 degrees of
-    freedom if the shift were nothing but what references may share; detectable_m: the least shift in its direction that
-    the search finds with a probability of 0.8.
+    freedom if the shift were nothing but what references may share (of the clearer part where two were joined);
+    detectable_m: the least shift in its direction that the search finds with a probability of 0.8.
     """
 
     station_ids: tuple[str, ...]
@@ -96,7 +96,7 @@ def _wrong_pieces(system: ShiftSystem, runs: list[Run], shared: float, limit: fl
     pieces = [(a, b) for a, b in pairwise(cuts) if any(begin <= a and b <= end for begin, end in runs)]
     of_points = np.bincount(system.points.segment, minlength=len(system))
     of_poses = np.bincount(system.poses.segment, minlength=len(system))
-    pieces = [(a, b) for a, b in pieces if of_poses[a:b].sum() or of_points[a:b].sum() >= _FEWEST_POINTS]
+    pieces = [(a, b) for a, b in pieces if of_poses[a:b].sum() or of_points[a:b].sum() >= FEWEST_POINTS]
     every, kept = _of_pieces(system, pieces), np.arange(len(pieces))
     while len(kept):
         shifts, cov, _ = every.estimate(np.eye(len(pieces))[:, kept])

@@ -1,7 +1,7 @@
 """Which given poses and points are tested for shifts in common, and the system of these shifts.
 
 A given point enters with what its rays and its coordinates say of each other (`given_points`). One that disagrees with
-its neighbours on the drive, on both sides, is a single blunder: it is not tested, and counts as little as its loss says.
+its neighbours on the drive, on both sides, is a single blunder: it is not tested, and counts as its loss says.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ _LOOSE = 1e-6  # of the trace: the least a point is taken to be known by in a di
 
 
 @dataclass(frozen=True, eq=False)
-class TestedRows:
+class ShiftRows:
     """Rows of pose priors and of point priors that are tested, with their stations."""
 
     pose: Indices
@@ -47,7 +47,7 @@ class TestedRows:
         return len(self.pose) + len(self.point)
 
 
-def tested_rows(block: Block, state: State, layout: Layout, losses: Losses) -> TestedRows:
+def tested_rows(block: Block, state: State, layout: Layout, losses: Losses) -> ShiftRows:
     """All localized poses, and the automatic GCPs that agree with their neighbours on the drive."""
     pose = np.flatnonzero(block.pose_priors.kind == KINDS_OF_POSE.index("localized"))
     point = np.flatnonzero(block.point_priors.kind == KINDS_OF_POINT.index(AUTOMATIC))
@@ -57,7 +57,7 @@ def tested_rows(block: Block, state: State, layout: Layout, losses: Losses) -> T
     seen = seen[np.argsort(station[seen], kind="stable")]
     point, station = point[seen], station[seen]
     supported = _supported(block, state, layout, point, losses)
-    return TestedRows(pose, block.station[block.pose_priors.image[pose]], point[supported], station[supported])
+    return ShiftRows(pose, block.station[block.pose_priors.image[pose]], point[supported], station[supported])
 
 
 def stations_of_points(block: Block) -> Indices:
@@ -73,7 +73,7 @@ def stations_of_points(block: Block) -> Indices:
     return out
 
 
-def with_singles_weighted(block: Block, state: State, tested: TestedRows, losses: Losses) -> Block:
+def with_singles_weighted(block: Block, state: State, tested: ShiftRows, losses: Losses) -> Block:
     """The block in which automatic GCPs that are not tested have the weight of their loss, tested ones their own."""
     priors = block.point_priors
     single = priors.kind == KINDS_OF_POINT.index(AUTOMATIC)
@@ -84,7 +84,7 @@ def with_singles_weighted(block: Block, state: State, tested: TestedRows, losses
 
 
 def shift_system(
-    block: Block, state: State, found: Cofactors, gradient: Array, tested: TestedRows, losses: Losses | None = None
+    block: Block, state: State, found: Cofactors, gradient: Array, tested: ShiftRows, losses: Losses | None = None
 ) -> ShiftSystem:
     """found, gradient: of the normal equations at the state, what is tested with its full weight; losses: of the image
     observations as in these."""
