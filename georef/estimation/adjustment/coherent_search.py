@@ -13,7 +13,7 @@ from georef.estimation.adjustment.coherent import CoherentSearch, coherent_block
 from georef.estimation.adjustment.constraint_terms import POSE_PRIORS
 from georef.estimation.adjustment.eliminate import Losses, normal_equations
 from georef.estimation.adjustment.prepared import Prepared
-from georef.estimation.adjustment.shift_rows import AUTOMATIC, shift_system, tested_rows, with_singles_weighted
+from georef.estimation.adjustment.shift_rows import AUTOMATIC, shift_rows, shift_system, with_singles_weighted
 
 
 def search_coherent(
@@ -23,7 +23,7 @@ def search_coherent(
     else with that of its loss, so that its single blunders do not bend the network. Surveyed control and GNSS are
     never part of a stretch; they are what it is held against."""
     prepared = prepared or Prepared.of(block)
-    tested = tested_rows(block, state, prepared.layout, losses)
+    tested = shift_rows(block, state, prepared.layout, losses)
     if not len(tested):
         return CoherentSearch((), False)
     block = with_singles_weighted(block, state, tested, losses)

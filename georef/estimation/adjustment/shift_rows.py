@@ -47,7 +47,7 @@ class ShiftRows:
         return len(self.pose) + len(self.point)
 
 
-def tested_rows(block: Block, state: State, layout: Layout, losses: Losses) -> ShiftRows:
+def shift_rows(block: Block, state: State, layout: Layout, losses: Losses) -> ShiftRows:
     """All localized poses, and the automatic GCPs that agree with their neighbours on the drive."""
     pose = np.flatnonzero(block.pose_priors.kind == KINDS_OF_POSE.index("localized"))
     point = np.flatnonzero(block.point_priors.kind == KINDS_OF_POINT.index(AUTOMATIC))
