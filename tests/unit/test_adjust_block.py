@@ -150,6 +150,6 @@ def test_a_right_pose_in_a_named_block_is_taken_back(clean: tuple[RigBlock, Adju
     none = np.zeros(0, np.int64)
     named = CoherentBlock(("s0", "s1"), np.array([0, 1]), none, (), shift, 1e-4 * np.eye(3), 100.0, 0.1)
     found = quality(lacking, state)
-    search = settled(CoherentSearch((named,), False), spoilt, state, found.cofactors, found.images.points, 0.999)
+    search = settled(CoherentSearch((named,), False), spoilt, state, found.cofactors, found.images.points)
     assert [wrong.poses.tolist() for wrong in search.blocks] == [[0]]
     assert search.blocks[0].station_ids == (block.station_ids[block.station[block.pose_priors.image[0]]],)

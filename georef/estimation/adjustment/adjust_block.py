@@ -11,15 +11,21 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from georef.estimation.adjustment.block import KINDS_OF_POINT, Block, State
-from georef.estimation.adjustment.block_gates import RejectedConstraint, without_contradictions
+from georef.estimation.adjustment.block import KINDS_OF_POINT, KINDS_OF_POSE, Block, State
+from georef.estimation.adjustment.block_gates import Contradictions, RejectedConstraint, name_of
 from georef.estimation.adjustment.block_quality import Quality, quality
 from georef.estimation.adjustment.coherent import CoherentBlock, CoherentSearch
 from georef.estimation.adjustment.coherent_members import settled
-from georef.estimation.adjustment.coherent_search import search_coherent, without_named
+from georef.estimation.adjustment.coherent_search import (
+    named_rows,
+    search_coherent,
+    shared_by_references,
+    without_named,
+)
 from georef.estimation.adjustment.constraint_terms import DISTANCES, POSE_PRIORS, POSITION_PRIORS, RELATIVE_POSES
 from georef.estimation.adjustment.eliminate import IMAGE_OBSERVATIONS
 from georef.estimation.adjustment.prepared import Prepared
+from georef.estimation.adjustment.shift_rows import AUTOMATIC
 from georef.estimation.adjustment.solver import BlockSolution, Solve, SolverOptions, solve_block
 
 _GATE_ROUNDS, _ROBUST_ROUNDS = 3, 2
@@ -99,17 +105,15 @@ def adjust_block(
     such as `checkpoints.Resumable`. Image sigmas are scaled by their own variance component; sigmas of constraints are
     tested and reported, never changed. Raises GeorefError where the constraints leave the datum open.
     """
+    options = replace(options, reference_m=float(np.hypot(options.reference_m, shared_by_references(block))))
     hand = _InHand(block, Prepared.of(block))
     hand, state, found = _robust(hand, start or block.start(), options, solve)
-    gross = 1.0 - _GROSS * (1.0 - options.gate_probability)
-    gated = hand.gated(found, gross)
+    gated = hand.gated(found, _gross(options))
     search = search_coherent(
         *(gated.block, state, options.losses), reference_m=options.reference_m, prepared=gated.prepared
     )
-    if search.blocks:
-        gated, state, found, search = _without_coherent(gated, state, search, options, solve)
-    kept, rejected = without_contradictions(gated.block, found.constraints, gross)
-    hand, solution, found, more = _refined(gated.given(kept), state, options, solve)
+    hand, state, search, rejected = _without_wrong(gated, state, found, search, options, solve)
+    hand, solution, found, more = _refined(hand, state, options, solve)
     return AdjustedBlock(
         *(hand.block, solution, found, rejected + more, search.blocks, search.undecidable),
         *(len(block.observations) - len(hand.block.observations), hand.scale),
@@ -135,17 +139,39 @@ def _robust_state(hand: _InHand, state: State, options: BlockOptions, solve: Sol
     return solve(hand.block, losses=options.losses, options=solver, start=state, prepared=hand.prepared).state
 
 
-def _without_coherent(
-    hand: _InHand, state: State, search: CoherentSearch, options: BlockOptions, solve: Solve
-) -> tuple[_InHand, State, Quality, CoherentSearch]:
-    """What is named is taken out, but for what agrees with the rest once the others are out."""
-    lacking = hand.given(without_named(hand.block, search))
-    state = _robust_state(lacking, state, options, solve)
-    found = lacking.quality(state)
-    args = hand.block, state, found.cofactors, found.images.points, options.gate_probability
-    search = settled(search, *args)
-    hand = hand.given(without_named(hand.block, search))
-    return hand, state, hand.quality(state), search
+def _without_wrong(
+    hand: _InHand, state: State, found: Quality, search: CoherentSearch, options: BlockOptions, solve: Solve
+) -> tuple[_InHand, State, CoherentSearch, tuple[RejectedConstraint, ...]]:
+    """What is named is taken out, but for what agrees with the rest once the others are out, and so are single gross
+    contradictions. state, found: before that, of the same constraints."""
+    lacking = hand
+    if search.blocks:
+        lacking = hand.given(without_named(hand.block, search))
+        state = _robust_state(lacking, state, options, solve)
+        found = lacking.quality(state)
+    wrong = Contradictions.of(lacking.block, found.constraints, _gross(options))
+    named_before = named_rows(hand.block, search)
+    search = settled(
+        *(search, hand.block, state, found.cofactors, found.images.points),
+        probability=options.gate_probability,
+        reference_m=options.reference_m,
+    )
+    poses, points = named_rows(hand.block, search)
+    names = {name_of(hand.block, KINDS_OF_POSE[0], int(row)) for row in np.flatnonzero(poses)}
+    names |= {name_of(hand.block, AUTOMATIC, int(row)) for row in np.flatnonzero(points)}
+    poses[np.flatnonzero(~named_before[0])[wrong.poses]] = True
+    points[np.flatnonzero(~named_before[1])[wrong.points]] = True
+    block = replace(
+        wrong.without(lacking.block),
+        pose_priors=hand.block.pose_priors.take(~poses),
+        point_priors=hand.block.point_priors.take(~points),
+    )
+    single = tuple(r for r in wrong.rejected if r.kind not in (KINDS_OF_POSE[0], AUTOMATIC) or r.name not in names)
+    return hand.given(block), state, search, single
+
+
+def _gross(options: BlockOptions) -> float:
+    return 1.0 - _GROSS * (1.0 - options.gate_probability)
 
 
 def _refined(
@@ -168,11 +194,11 @@ def _refined(
     hand, solution, found = rescaled(*solved(hand, state))
     rejected, settled = (), _SETTLED_SHARE * len(hand.block.observations)
     for _ in range(_GATE_ROUNDS):
-        kept, more = without_contradictions(hand.block, found.constraints, options.gate_probability)
-        gated = hand.given(kept).gated(found, options.gate_probability)
-        if not more and len(hand.block.observations) - len(gated.block.observations) <= settled:
+        wrong = Contradictions.of(hand.block, found.constraints, options.gate_probability)
+        gated = hand.given(wrong.without(hand.block)).gated(found, options.gate_probability)
+        if not wrong.rejected and len(hand.block.observations) - len(gated.block.observations) <= settled:
             break
-        rejected = rejected + more
+        rejected = rejected + wrong.rejected
         hand, solution, found = solved(gated, solution.state)
     return (*rescaled(hand, solution, found), rejected)
 

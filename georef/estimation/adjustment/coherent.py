@@ -62,7 +62,7 @@ class CoherentSearch:
 def coherent_blocks(block: Block, system: ShiftSystem, *, reference_m: float = 0.01) -> CoherentSearch:
     """Names the stretches of what is given wrong. reference_m: 1-sigma of the errors that what is right in a stretch
     may have in common (those of the reference images it was localized against)."""
-    shared, limit = reference_m**2, float(chi2.isf(_FALSE_ALARM / (_RUNS_A_SEGMENT * max(len(system), 1)), 3))
+    shared, limit = reference_m**2, search_limit(len(system))
     pieces = _joined(system, _wrong_pieces(system, _runs(system, shared, limit), shared, limit), limit)
     if not pieces:
         return CoherentSearch((), False)
@@ -71,6 +71,11 @@ def coherent_blocks(block: Block, system: ShiftSystem, *, reference_m: float = 0
         _named(block, system, piece, shifts[k], _own(cov, k, k), shared, limit) for k, piece in enumerate(pieces)
     )
     return CoherentSearch(named, _undecidable(system, pieces, limit))
+
+
+def search_limit(segments: int) -> float:
+    """What the statistic of a shift (3 degrees of freedom) has to exceed in a search over so many segments."""
+    return float(chi2.isf(_FALSE_ALARM / (_RUNS_A_SEGMENT * max(segments, 1)), 3))
 
 
 def _runs(system: ShiftSystem, shared: float, limit: float) -> list[Run]:
@@ -171,7 +176,7 @@ def _named(
     return CoherentBlock(
         tuple(block.station_ids[i] for i in stations),
         *(poses.row, points.row, references_of(block, points.row), shift, cov, statistic),
-        float(np.linalg.norm(shift) * np.sqrt(_noncentrality(limit) / statistic)),
+        detectable(shift, statistic, limit),
     )
 
 
@@ -187,6 +192,11 @@ def references_of(block: Block, points: Indices) -> tuple[str, ...]:
         return ()
     chosen = np.isin(rays.point, block.point_priors.point[points])
     return tuple(rays.image_ids[i] for i in np.unique(rays.reference[chosen]))
+
+
+def detectable(shift: Array, statistic: float, limit: float) -> float:
+    """The least shift (m) in the direction of one with this statistic that exceeds a limit with probability _POWER."""
+    return float(np.linalg.norm(shift) * np.sqrt(_noncentrality(limit) / statistic))
 
 
 @cache

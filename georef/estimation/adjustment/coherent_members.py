@@ -13,15 +13,22 @@ from typing import NamedTuple
 import numpy as np
 from scipy.stats import chi2
 
-from georef.estimation.adjustment.block import KINDS_OF_POINT, KINDS_OF_POSE, Block, Indices, State
+from georef.estimation.adjustment.block import KINDS_OF_POSE, Block, Indices, State
 from georef.estimation.adjustment.cofactors import Cofactors
-from georef.estimation.adjustment.coherent import FEWEST_POINTS, CoherentBlock, CoherentSearch, references_of
+from georef.estimation.adjustment.coherent import (
+    FEWEST_POINTS,
+    CoherentBlock,
+    CoherentSearch,
+    references_of,
+    search_limit,
+)
+from georef.estimation.adjustment.coherent_clusters import PointOffsets, clusters
 from georef.estimation.adjustment.constraint_terms import POSE_PRIORS, constraint_terms, whitening
 from georef.estimation.adjustment.group_tests import fitted_cofactor
-from georef.estimation.adjustment.shift_rows import AUTOMATIC, stations_of_points
 from georef.geometry.rigid import Array
 
 _SEAM = 3  # stations beyond the ends of a block that may belong to it
+_CONTRADICTS = 1e-6  # how seldom a right point is as far off as one of a cluster
 _SAME = 0.9999  # that two estimates of one shift are taken for the same
 
 
@@ -37,31 +44,43 @@ class _Candidates:
 
 
 def settled(
-    search: CoherentSearch, block: Block, state: State, found: Cofactors, points: Array, probability: float
+    search: CoherentSearch,
+    block: Block,
+    state: State,
+    found: Cofactors,
+    points: Array,
+    *,
+    probability: float = 0.999,
+    reference_m: float = 0.01,
 ) -> CoherentSearch:
     """The search with the members of each block told one by one.
 
     One that agrees with the rest after all, and better so than with the shift of its block, is let go; one that
     disagrees belongs to the block near by whose shift explains it best. A block of fewer points than a search would
-    name is none. block has all priors; state, found and points (P, 3, 3), the cofactors, are those of the adjustment
-    that lacks the named ones.
+    name is none; contradicting points that belong to none may form one by themselves (`coherent_clusters`). block has
+    all priors; state, found and points (P, 3, 3), the cofactors, are those of the adjustment that lacks the named ones.
     """
-    of_poses = _poses(block, state, found)
-    of_points = _points(block, state, points)
+    of_poses, offsets = _poses(block, state, found), PointOffsets.of(block, state, points)
+    of_points = _points(offsets)
     pose_owner = _owners(of_poses, [wrong.poses for wrong in search.blocks], search.blocks, probability)
     point_owner = _owners(of_points, [wrong.points for wrong in search.blocks], search.blocks, probability)
-    blocks = []
+    placed = []
     for k, wrong in enumerate(search.blocks):
         mine, given = pose_owner == k, point_owner == k
         if not mine.any() and given.sum() < FEWEST_POINTS:
+            point_owner[given] = -1
             continue
         stations = np.unique(np.concatenate([of_poses.station[mine], of_points.station[given]]))
-        rows = of_points.row[given]
+        rows = np.sort(of_points.row[given])
         names = tuple(block.station_ids[i] for i in stations)
         references = references_of(block, rows)
         wrong = replace(wrong, station_ids=names, poses=of_poses.row[mine], points=rows, references=references)
-        blocks.append(_Placed(wrong, int(stations[0]), int(stations[-1])))
-    return CoherentSearch(tuple(_joined(blocks, block)), search.undecidable)
+        placed.append(_Placed(wrong, int(stations[0]), int(stations[-1])))
+    alone = np.flatnonzero((point_owner < 0) & (offsets.squares() > chi2.isf(_CONTRADICTS, 3)))
+    few = clusters(block, offsets.take(alone), reference_m**2, search_limit(len(block.station_ids)))
+    at = {name: i for i, name in enumerate(block.station_ids)}
+    placed += [_Placed(wrong, at[wrong.station_ids[0]], at[wrong.station_ids[-1]]) for wrong in few]
+    return CoherentSearch(tuple(_joined(placed, block)), search.undecidable)
 
 
 class _Placed(NamedTuple):
@@ -142,18 +161,12 @@ def _poses(block: Block, state: State, found: Cofactors) -> _Candidates:
     return _Candidates(row, block.station[block.pose_priors.image[row]], 6, statistic)
 
 
-def _points(block: Block, state: State, points: Array) -> _Candidates:
-    """The same of automatic GCPs; NaN where nothing else determines the point."""
-    priors = block.point_priors
-    station = stations_of_points(block)[priors.point]
-    row = np.flatnonzero((priors.kind == KINDS_OF_POINT.index(AUTOMATIC)) & (station >= 0))
-
-    def statistic(chosen: Indices, shift: Array, shift_cov: Array) -> Array:
-        rows = row[chosen]
-        off = state.points[priors.point[rows]] - priors.position[rows] + shift
-        return _squares(off, np.linalg.inv(priors.information[rows]) + points[priors.point[rows]] + shift_cov)
-
-    return _Candidates(row, station[row], 3, statistic)
+def _points(offsets: PointOffsets) -> _Candidates:
+    """The same of automatic GCPs."""
+    return _Candidates(
+        *(offsets.row, offsets.station, 3),
+        lambda chosen, shift, shift_cov: offsets.take(chosen).squares(shift, shift_cov),
+    )
 
 
 def _squares(residual: Array, cov: Array) -> Array:

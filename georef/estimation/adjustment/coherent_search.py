@@ -31,7 +31,7 @@ def search_coherent(
     lin = normal_equations(block, state, losses=rest, prepared=prepared)
     found = inverted(block, state, lin, prepared)
     system = shift_system(block, state, found, lin.reduced.gradient, tested, rest)
-    return coherent_blocks(block, system, reference_m=reference_m + shared_by_references(block))
+    return coherent_blocks(block, system, reference_m=reference_m)
 
 
 def shared_by_references(block: Block) -> float:
