@@ -29,7 +29,8 @@ from georef.estimation.adjustment.shift_rows import AUTOMATIC
 from georef.estimation.adjustment.solver import BlockSolution, Solve, SolverOptions, solve_block
 
 _GATE_ROUNDS, _ROBUST_ROUNDS = 3, 2
-_ROBUST_COST_TOLERANCE = 1e-5
+_ROBUST_COST_TOLERANCE = 1e-3  # reweighting converges slowly, and gates need no more
+_GATED_STEP = 1e-5  # of a solution that gates follow, m and rad: where the last one stops is the user's choice
 _FAR_OFF = 1.25  # of a sigma against its residuals
 _SETTLED_SHARE = 1e-4  # of the observations: a gate that drops fewer changes nothing
 _FACTOR_TOLERANCE = 0.05
@@ -108,6 +109,7 @@ def adjust_block(
     options = replace(options, reference_m=float(np.hypot(options.reference_m, shared_by_references(block))))
     hand = _InHand(block, Prepared.of(block))
     hand, state, found = _robust(hand, start or block.start(), options, solve)
+    options = replace(options, solver=replace(options.solver, damping=0.0))  # what follows starts near its solution
     gated = hand.gated(found, _gross(options))
     search = search_coherent(
         *(gated.block, state, options.losses), reference_m=options.reference_m, prepared=gated.prepared
@@ -134,7 +136,7 @@ def _robust(hand: _InHand, state: State, options: BlockOptions, solve: Solve) ->
 
 
 def _robust_state(hand: _InHand, state: State, options: BlockOptions, solve: Solve) -> State:
-    """The robust solution as closely as gates need it: reweighting converges slowly."""
+    """The robust solution as closely as gates need it."""
     solver = replace(options.solver, cost_tolerance=max(options.solver.cost_tolerance, _ROBUST_COST_TOLERANCE))
     return solve(hand.block, losses=options.losses, options=solver, start=state, prepared=hand.prepared).state
 
@@ -178,29 +180,35 @@ def _refined(
     hand: _InHand, state: State, options: BlockOptions, solve: Solve
 ) -> tuple[_InHand, BlockSolution, Quality, tuple[RejectedConstraint, ...]]:
     """Solutions without robust losses and gates by turns, until a gate changes nothing."""
-
-    def solved(hand: _InHand, state: State) -> tuple[_InHand, BlockSolution, Quality]:
-        solution = solve(hand.block, options=options.solver, start=state, prepared=hand.prepared)
-        return hand, solution, hand.quality(solution.state)
-
-    def rescaled(hand: _InHand, solution: BlockSolution, found: Quality) -> tuple[_InHand, BlockSolution, Quality]:
-        """The image sigmas brought to what the residuals show, the solution for them and its quality."""
-        component = found.components.get(IMAGE_OBSERVATIONS)
-        factor = None if component is None else component.factor
-        if factor is None or abs(factor - 1.0) < _FACTOR_TOLERANCE:
-            return hand, solution, found
-        return solved(hand.scaled(factor), solution.state)
-
-    hand, solution, found = rescaled(*solved(hand, state))
-    rejected, settled = (), _SETTLED_SHARE * len(hand.block.observations)
+    rough = replace(options.solver, step_tolerance=max(options.solver.step_tolerance, _GATED_STEP))
+    hand, solution, found = _rescaled(*_solved(hand, state, rough, solve), rough, solve)
+    rejected, solver, settled = (), rough, _SETTLED_SHARE * len(hand.block.observations)
     for _ in range(_GATE_ROUNDS):
         wrong = Contradictions.of(hand.block, found.constraints, options.gate_probability)
         gated = hand.given(wrong.without(hand.block)).gated(found, options.gate_probability)
         if not wrong.rejected and len(hand.block.observations) - len(gated.block.observations) <= settled:
             break
-        rejected = rejected + wrong.rejected
-        hand, solution, found = solved(gated, solution.state)
-    return (*rescaled(hand, solution, found), rejected)
+        rejected, solver = rejected + wrong.rejected, options.solver
+        hand, solution, found = _solved(gated, solution.state, solver, solve)
+    if solver is rough:
+        solution = solve(hand.block, options=options.solver, start=solution.state, prepared=hand.prepared)
+    return (*_rescaled(hand, solution, found, options.solver, solve), rejected)
+
+
+def _solved(hand: _InHand, state: State, solver: SolverOptions, solve: Solve) -> tuple[_InHand, BlockSolution, Quality]:
+    solution = solve(hand.block, options=solver, start=state, prepared=hand.prepared)
+    return hand, solution, hand.quality(solution.state)
+
+
+def _rescaled(
+    hand: _InHand, solution: BlockSolution, found: Quality, solver: SolverOptions, solve: Solve
+) -> tuple[_InHand, BlockSolution, Quality]:
+    """The image sigmas brought to what the residuals show, the solution for them and its quality."""
+    component = found.components.get(IMAGE_OBSERVATIONS)
+    factor = None if component is None else component.factor
+    if factor is None or abs(factor - 1.0) < _FACTOR_TOLERANCE:
+        return hand, solution, found
+    return _solved(hand.scaled(factor), solution.state, solver, solve)
 
 
 def _scaled(block: Block, factor: float) -> Block:

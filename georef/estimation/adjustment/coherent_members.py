@@ -8,9 +8,9 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import numpy as np
+from scipy.spatial import KDTree
 from scipy.stats import chi2
 
 from georef.estimation.adjustment.block import KINDS_OF_POSE, Block, Indices, State
@@ -28,6 +28,7 @@ from georef.estimation.adjustment.group_tests import fitted_cofactor
 from georef.geometry.rigid import Array
 
 _SEAM = 3  # stations beyond the ends of a block that may belong to it
+_NEAR_M = 15.0  # between points of one piece of the reference
 _CONTRADICTS = 1e-6  # how seldom a right point is as far off as one of a cluster
 _SAME = 0.9999  # that two estimates of one shift are taken for the same
 
@@ -64,7 +65,7 @@ def settled(
     of_points = _points(offsets)
     pose_owner = _owners(of_poses, [wrong.poses for wrong in search.blocks], search.blocks, probability)
     point_owner = _owners(of_points, [wrong.points for wrong in search.blocks], search.blocks, probability)
-    placed = []
+    blocks = []
     for k, wrong in enumerate(search.blocks):
         mine, given = pose_owner == k, point_owner == k
         if not mine.any() and given.sum() < FEWEST_POINTS:
@@ -75,37 +76,36 @@ def settled(
         names = tuple(block.station_ids[i] for i in stations)
         references = references_of(block, rows)
         wrong = replace(wrong, station_ids=names, poses=of_poses.row[mine], points=rows, references=references)
-        placed.append(_Placed(wrong, int(stations[0]), int(stations[-1])))
+        blocks.append(wrong)
     alone = np.flatnonzero((point_owner < 0) & (offsets.squares() > chi2.isf(_CONTRADICTS, 3)))
-    few = clusters(block, offsets.take(alone), reference_m**2, search_limit(len(block.station_ids)))
+    blocks += clusters(block, offsets.take(alone), reference_m**2, search_limit(len(block.station_ids)))
+    return CoherentSearch(tuple(_joined(blocks, block)), search.undecidable)
+
+
+def _joined(blocks: list[CoherentBlock], block: Block) -> list[CoherentBlock]:
+    """Blocks of one kind and of the same shift whose stations adjoin, or whose points lie near each other as those seen
+    from two passages of a street do, made one; in the order of their stations, poses first."""
     at = {name: i for i, name in enumerate(block.station_ids)}
-    placed += [_Placed(wrong, at[wrong.station_ids[0]], at[wrong.station_ids[-1]]) for wrong in few]
-    return CoherentSearch(tuple(_joined(placed, block)), search.undecidable)
+    left = sorted(blocks, key=lambda b: (len(b.points) > 0, at[b.station_ids[0]]))
+    out: list[CoherentBlock] = []
+    while left:
+        here = left.pop(0)
+        while (k := next((k for k, b in enumerate(left) if _one_piece(here, b, block, at)), -1)) >= 0:
+            here = _merged(here, left.pop(k), block)
+        out.append(here)
+    return out
 
 
-class _Placed(NamedTuple):
-    block: CoherentBlock
-    first: int  # station
-    last: int
-
-
-def _joined(placed: list[_Placed], block: Block) -> list[CoherentBlock]:
-    """Blocks of one kind and of the same shift whose stations adjoin made one."""
-    out: list[_Placed] = []
-    for here in sorted(placed, key=lambda p: (len(p.block.points) > 0, p.first)):
-        before = out[-1] if out else None
-        if before and here.first <= before.last + _SEAM and _alike(before.block, here.block):
-            merged = _Placed(_merged(before.block, here.block, block), before.first, max(before.last, here.last))
-            out[-1] = merged
-        else:
-            out.append(here)
-    return [p.block for p in out]
-
-
-def _alike(a: CoherentBlock, b: CoherentBlock) -> bool:
-    """Whether blocks are of one kind and their shifts may be the same."""
+def _one_piece(a: CoherentBlock, b: CoherentBlock, block: Block, at: dict[str, int]) -> bool:
+    """Whether blocks are of one kind, their shifts may be the same, and nothing is between them."""
     off, cov = a.shift_m - b.shift_m, a.cov + b.cov
-    return bool(len(a.points)) == bool(len(b.points)) and off @ np.linalg.solve(cov, off) < chi2.ppf(_SAME, 3)
+    if bool(len(a.points)) != bool(len(b.points)) or off @ np.linalg.solve(cov, off) > chi2.ppf(_SAME, 3):
+        return False
+    stations = [np.array([at[name] for name in c.station_ids]) for c in (a, b)]
+    if np.abs(stations[0][:, None] - stations[1]).min() <= _SEAM:
+        return True
+    places = [block.point_priors.position[c.points] for c in (a, b)]
+    return len(a.points) > 0 and float(KDTree(places[0]).query(places[1])[0].min()) <= _NEAR_M
 
 
 def _merged(a: CoherentBlock, b: CoherentBlock, block: Block) -> CoherentBlock:
@@ -114,7 +114,11 @@ def _merged(a: CoherentBlock, b: CoherentBlock, block: Block) -> CoherentBlock:
     cov = np.linalg.inv(weights[0] + weights[1])
     points = np.union1d(a.points, b.points)
     return CoherentBlock(
-        *(tuple(dict.fromkeys((*a.station_ids, *b.station_ids))), np.union1d(a.poses, b.poses), points),
+        *(
+            tuple(sorted({*a.station_ids, *b.station_ids}, key=block.station_ids.index)),
+            np.union1d(a.poses, b.poses),
+            points,
+        ),
         *(references_of(block, points), cov @ (weights[0] @ a.shift_m + weights[1] @ b.shift_m), cov),
         *(max(a.statistic, b.statistic), min(a.detectable_m, b.detectable_m)),
     )
