@@ -10,10 +10,12 @@ import pytest
 from georef.errors import GeorefError
 from georef.estimation.adjustment.adjust_block import AdjustedBlock, BlockOptions, adjust_block, quality
 from georef.estimation.adjustment.block import Block, PointPriors, PosePriors, PositionPriors
-from georef.estimation.adjustment.coherent import CoherentBlock, CoherentSearch, without_agreeing
+from georef.estimation.adjustment.coherent import CoherentBlock, CoherentSearch
+from georef.estimation.adjustment.coherent_members import settled
 from georef.estimation.adjustment.constraint_terms import POSITION_PRIORS
 from georef.estimation.adjustment.eliminate import IMAGE_OBSERVATIONS, normal_equations
-from georef.estimation.adjustment.shift_system import ShiftSystem, pose_shifts
+from georef.estimation.adjustment.shift_rows import ShiftRows, shift_system
+from georef.estimation.adjustment.shift_system import ShiftSystem
 from georef.estimation.adjustment.solver import solve_block
 from tests.worlds.rig_blocks import RigBlock, rig_block
 
@@ -120,13 +122,13 @@ def test_shifts_of_poses_against_adding_them_as_unknowns(clean: tuple[RigBlock, 
     poses = block.pose_priors.world_from_cam
 
     def system_of(case: Block) -> ShiftSystem:
-        lin = normal_equations(case, state)
-        system = pose_shifts(case, state, quality(case, state).cofactors, lin.reduced.gradient)
-        assert system is not None
-        return system
+        lin, none = normal_equations(case, state), np.zeros(0, np.int64)
+        rows = np.flatnonzero(case.pose_priors.kind == 0)
+        tested = ShiftRows(rows, case.station[case.pose_priors.image[rows]], none, none)
+        return shift_system(case, state, quality(case, state).cofactors, lin.reduced.gradient, tested)
 
     before = system_of(block)
-    chosen = np.isin(np.arange(len(poses)), before.rows[before.segment == 0])
+    chosen = np.isin(np.arange(len(poses)), before.poses.row[before.poses.segment == 0])
     moved = replace(poses, translation=poses.translation + np.where(chosen[:, None], planted, 0.0))
     after = system_of(replace(block, pose_priors=replace(block.pose_priors, world_from_cam=moved)))
     design = np.eye(len(before))[:, :1]
@@ -145,6 +147,9 @@ def test_a_right_pose_in_a_named_block_is_taken_back(clean: tuple[RigBlock, Adju
     moved[0] += shift
     spoilt = replace(block, pose_priors=replace(block.pose_priors, world_from_cam=replace(poses, translation=moved)))
     lacking = replace(block, pose_priors=block.pose_priors.take(np.arange(len(poses)) > 1))
-    named = CoherentBlock(("s0", "s1"), np.array([0, 1]), shift, 1e-4 * np.eye(3), 100.0)
-    search = without_agreeing(CoherentSearch((named,), False), spoilt, state, quality(lacking, state).cofactors, 0.999)
-    assert [wrong.rows.tolist() for wrong in search.blocks] == [[0]]
+    none = np.zeros(0, np.int64)
+    named = CoherentBlock(("s0", "s1"), np.array([0, 1]), none, (), shift, 1e-4 * np.eye(3), 100.0, 0.1)
+    found = quality(lacking, state)
+    search = settled(CoherentSearch((named,), False), spoilt, state, found.cofactors, found.images.points)
+    assert [wrong.poses.tolist() for wrong in search.blocks] == [[0]]
+    assert search.blocks[0].station_ids == (block.station_ids[block.station[block.pose_priors.image[0]]],)

@@ -81,7 +81,7 @@ def test_an_adjustment_that_is_interrupted_again_and_again_does_no_iteration_twi
     block, options = rig_block(2).block, BlockOptions.of(2.0)
     through = _Memory(10**9)
     whole = adjust_block(block, options, Resumable(through))
-    kept = _Memory(3)
+    kept = _Memory(2)
     interruptions = 0
     while True:
         try:

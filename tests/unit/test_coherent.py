@@ -11,7 +11,7 @@ from scipy.stats import chi2
 
 from georef.estimation.adjustment.block import Block, Calibration, PosePriors, RigCamera
 from georef.estimation.adjustment.coherent import CoherentSearch, coherent_blocks
-from georef.estimation.adjustment.shift_system import ShiftSystem
+from georef.estimation.adjustment.shift_system import Members, ShiftSystem
 from georef.geometry.camera import Camera
 from georef.geometry.poses import Poses
 from georef.geometry.rigid import Array, Rigid3
@@ -47,7 +47,8 @@ def _world(
     information: Any = np.kron(mine[:, len(others) :] / _POSE_M**2, np.eye(3))
     right = (mine @ observed) / _POSE_M
     rows = np.arange(stations)
-    return _World(_block(stations), ShiftSystem(information, right.ravel(), rows, rows))
+    poses = Members(rows, rows, rows)
+    return _World(_block(stations), ShiftSystem(information, right.ravel(), poses, Members.none(), ((0, stations),)))
 
 
 def _block(stations: int) -> Block:
@@ -75,12 +76,12 @@ def _search(world: _World) -> CoherentSearch:
 
 def _check(found: CoherentSearch, wrong: dict[tuple[int, int], list[float]], stations: int = 150) -> None:
     """Every block named with its shift within its sigma, no more than 1 % of the good poses in them."""
-    named = {int(row) for block in found.blocks for row in block.rows}
+    named = {int(row) for block in found.blocks for row in block.poses}
     bad = {i for begin, end in wrong for i in range(begin, end)}
     assert len(named - bad) <= 0.01 * (stations - len(bad)) + 0.5
     assert len(bad - named) <= 0.03 * len(bad)
     for (begin, end), shift in wrong.items():
-        mine = max(found.blocks, key=lambda b: np.isin(b.rows, np.arange(begin, end)).sum())
+        mine = max(found.blocks, key=lambda b: np.isin(b.poses, np.arange(begin, end)).sum())
         off: Array = mine.shift_m - np.array(shift)
         assert off @ np.linalg.solve(mine.cov, off) < chi2.ppf(0.9999, 3)
 

@@ -1,7 +1,7 @@
 """The adjustment of a block against blunders: Cauchy, gates, refit without a robust loss, quality.
 
-Every kind of observation has its own loss and gate. Coherent blocks of wrong poses are looked for before single ones:
-a robust loss does not see through a stretch whose neighbours confirm each other.
+Every kind of observation has its own loss and gate. Coherent blocks of wrong poses and automatic GCPs are looked for
+before single ones: a robust loss does not see through a stretch whose neighbours confirm each other.
 """
 
 from __future__ import annotations
@@ -11,24 +11,26 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from georef.errors import GeorefError
-from georef.estimation.adjustment.block import KINDS_OF_POINT, Block, State
-from georef.estimation.adjustment.block_cholesky import SingularMatrix
-from georef.estimation.adjustment.block_gates import RejectedConstraint, without_contradictions
-from georef.estimation.adjustment.cofactors import Cofactors, cofactors
-from georef.estimation.adjustment.coherent import CoherentBlock, CoherentSearch, coherent_blocks, without_agreeing
-from georef.estimation.adjustment.components import Component
+from georef.estimation.adjustment.block import KINDS_OF_POINT, KINDS_OF_POSE, Block, State
+from georef.estimation.adjustment.block_gates import Contradictions, RejectedConstraint, name_of
+from georef.estimation.adjustment.block_quality import Quality, quality
+from georef.estimation.adjustment.coherent import CoherentBlock, CoherentSearch
+from georef.estimation.adjustment.coherent_members import settled
+from georef.estimation.adjustment.coherent_search import (
+    named_rows,
+    search_coherent,
+    shared_by_references,
+    without_named,
+)
 from georef.estimation.adjustment.constraint_terms import DISTANCES, POSE_PRIORS, POSITION_PRIORS, RELATIVE_POSES
-from georef.estimation.adjustment.datum import explain_singular
-from georef.estimation.adjustment.eliminate import IMAGE_OBSERVATIONS, Linearized, normal_equations
-from georef.estimation.adjustment.group_tests import ImageTests, TermTests, components, constraint_tests, image_tests
+from georef.estimation.adjustment.eliminate import IMAGE_OBSERVATIONS
 from georef.estimation.adjustment.prepared import Prepared
-from georef.estimation.adjustment.reference_part import ReferencePart
-from georef.estimation.adjustment.shift_system import pose_shifts
+from georef.estimation.adjustment.shift_rows import AUTOMATIC
 from georef.estimation.adjustment.solver import BlockSolution, Solve, SolverOptions, solve_block
 
 _GATE_ROUNDS, _ROBUST_ROUNDS = 3, 2
-_ROBUST_COST_TOLERANCE = 1e-5
+_ROBUST_COST_TOLERANCE = 1e-3  # reweighting converges slowly, and gates need no more
+_GATED_STEP = 1e-5  # of a solution that gates follow, m and rad: where the last one stops is the user's choice
 _FAR_OFF = 1.25  # of a sigma against its residuals
 _SETTLED_SHARE = 1e-4  # of the observations: a gate that drops fewer changes nothing
 _FACTOR_TOLERANCE = 0.05
@@ -38,7 +40,7 @@ _GROSS = 1e-3  # share of the false alarms of a gate that the first one may give
 @dataclass(frozen=True)
 class BlockOptions:
     """losses: scale in sigmas of the Cauchy loss of each kind. gate_probability: what good observations pass with.
-    reference_m: 1-sigma of the errors that right poses of a stretch may share."""
+    reference_m: 1-sigma of the errors that right poses or points of a stretch may share, beside those of references."""
 
     losses: Mapping[str, float]
     gate_probability: float = 0.999
@@ -53,22 +55,11 @@ class BlockOptions:
 
 
 @dataclass(frozen=True, eq=False)
-class Quality:
-    """Cofactors and tests of a block at a state."""
-
-    cofactors: Cofactors
-    images: ImageTests
-    constraints: list[TermTests]
-    components: dict[str, Component]
-    references: ReferencePart | None  # what the errors of reference images add through automatic GCPs
-
-
-@dataclass(frozen=True, eq=False)
 class AdjustedBlock:
     """A block that passed its gates, its solution and its quality.
 
     sigma_scale: of the image observations, against the block as it was given; dropped: how many of them were. wrong:
-    coherent blocks of poses; undecidable: which of their sides is wrong, nothing but their number tells.
+    coherent blocks of poses or points; undecidable: which of their sides is wrong, nothing but their number tells.
     """
 
     block: Block
@@ -81,78 +72,143 @@ class AdjustedBlock:
     sigma_scale: float
 
 
-def adjust_block(block: Block, options: BlockOptions, solve: Solve = solve_block) -> AdjustedBlock:
+@dataclass(frozen=True, eq=False)
+class _InHand:
+    """A block on its way through the gates, with what is prepared for it, and the scale of its image sigmas."""
+
+    block: Block
+    prepared: Prepared
+    scale: float = 1.0
+
+    def given(self, block: Block) -> _InHand:
+        """With other constraints, fewer ones perhaps, or other sigmas; the same image observations."""
+        return replace(self, block=block, prepared=self.prepared.restricted(block))
+
+    def scaled(self, factor: float) -> _InHand:
+        return replace(self.given(_scaled(self.block, factor)), scale=self.scale * factor)
+
+    def gated(self, found: Quality, probability: float) -> _InHand:
+        """Without image observations that contradict the rest."""
+        kept = ~found.images.rejected(probability, found.images.scale)
+        block = replace(self.block, observations=self.block.observations.take(kept))
+        return replace(self, block=block, prepared=self.prepared.restricted(block, kept))
+
+    def quality(self, state: State) -> Quality:
+        return quality(self.block, state, self.prepared)
+
+
+def adjust_block(
+    block: Block, options: BlockOptions, solve: Solve = solve_block, start: State | None = None
+) -> AdjustedBlock:
     """Adjusts a block in which observations and constraints may be wrong.
 
-    Image sigmas are scaled by their own variance component; sigmas of constraints are tested and reported, never
-    changed. solve: how its solves are done, such as `checkpoints.Resumable`. Raises GeorefError where the constraints
-    leave the datum open.
+    start: another state than the approximate values; the robust stage begins there. solve: how its solves are done,
+    such as `checkpoints.Resumable`. Image sigmas are scaled by their own variance component; sigmas of constraints are
+    tested and reported, never changed. Raises GeorefError where the constraints leave the datum open.
     """
-    given, gross = block, 1.0 - _GROSS * (1.0 - options.gate_probability)
-    block, state, scale, found = _robust(block, block.start(), options, solve)
-    block, _ = _gate_images(block, found, gross)
-    search = _coherent(block, state, options)
-    if search.blocks:
-        lacking = _without_rows(block, search)
-        state = _robust_state(lacking, state, options, solve)
-        search = without_agreeing(search, block, state, quality(lacking, state).cofactors, options.gate_probability)
-        block = _without_rows(block, search)
-    block, rejected = without_contradictions(block, quality(block, state).constraints, gross)
-    solution = solve(block, options=options.solver, start=state)
-    found = quality(block, solution.state)
-    block, solution, scale, found = _rescaled(block, solution, scale, found, options, solve)
-    for _ in range(_GATE_ROUNDS):
-        kept, more = without_contradictions(block, found.constraints, options.gate_probability)
-        kept, dropped = _gate_images(kept, found, options.gate_probability)
-        if not more and dropped <= _SETTLED_SHARE * len(given.observations):
-            break
-        block, rejected = kept, rejected + more
-        solution = solve(block, options=options.solver, start=solution.state)
-        found = quality(block, solution.state)
-    block, solution, scale, found = _rescaled(block, solution, scale, found, options, solve)
-    dropped = len(given.observations) - len(block.observations)
-    return AdjustedBlock(block, solution, found, rejected, search.blocks, search.undecidable, dropped, scale)
+    options = replace(options, reference_m=float(np.hypot(options.reference_m, shared_by_references(block))))
+    hand = _InHand(block, Prepared.of(block))
+    hand, state, found = _robust(hand, start or block.start(), options, solve)
+    options = replace(options, solver=replace(options.solver, damping=0.0))  # what follows starts near its solution
+    gated = hand.gated(found, _gross(options))
+    search = search_coherent(
+        *(gated.block, state, options.losses), reference_m=options.reference_m, prepared=gated.prepared
+    )
+    hand, state, search, rejected = _without_wrong(gated, state, found, search, options, solve)
+    hand, solution, found, more = _refined(hand, state, options, solve)
+    return AdjustedBlock(
+        *(hand.block, solution, found, rejected + more, search.blocks, search.undecidable),
+        *(len(block.observations) - len(hand.block.observations), hand.scale),
+    )
 
 
-def quality(block: Block, state: State) -> Quality:
-    """Cofactors, tests and variance components at a state, for the stated sigmas. Raises GeorefError where the normal
-    equations are singular."""
-    prepared = Prepared.of(block)
-    lin = normal_equations(block, state, prepared=prepared)
-    found = _inverted(block, state, lin)
-    images = image_tests(block, state, found, prepared)
-    references = ReferencePart.of(block, state, found)
-    tests = constraint_tests(block, state, found, images.points, references)
-    return Quality(found, images, tests, components(block, state, images, tests), references)
-
-
-def _inverted(block: Block, state: State, lin: Linearized) -> Cofactors:
-    try:
-        return cofactors(lin.reduced)
-    except SingularMatrix:
-        words = explain_singular(block, state, lin.reduced)
-        raise GeorefError(
-            words or "The adjustment has no unique solution: its constraints leave unknowns open."
-        ) from None
-
-
-def _robust(block: Block, state: State, options: BlockOptions, solve: Solve) -> tuple[Block, State, float, Quality]:
+def _robust(hand: _InHand, state: State, options: BlockOptions, solve: Solve) -> tuple[_InHand, State, Quality]:
     """The robust solution, with image sigmas near what the residuals show: a loss far too narrow fits too few."""
-    scale = 1.0
-    for _ in range(1 + _ROBUST_ROUNDS):
-        state = _robust_state(block, state, options, solve)
-        found = quality(block, state)
+    for _ in range(_ROBUST_ROUNDS):
+        state = _robust_state(hand, state, options, solve)
+        found = hand.quality(state)
         factor = min(max(found.images.scale, 0.1), 10.0)
         if 1.0 / _FAR_OFF < factor < _FAR_OFF:
-            return block, state, scale, found
-        block, scale = _scaled(block, factor), scale * factor
-    return block, state, scale, quality(block, state)
+            return hand, state, found
+        hand = hand.scaled(factor)
+    state = _robust_state(hand, state, options, solve)
+    return hand, state, hand.quality(state)
 
 
-def _robust_state(block: Block, state: State, options: BlockOptions, solve: Solve) -> State:
-    """The robust solution as closely as gates need it: reweighting converges slowly."""
+def _robust_state(hand: _InHand, state: State, options: BlockOptions, solve: Solve) -> State:
+    """The robust solution as closely as gates need it."""
     solver = replace(options.solver, cost_tolerance=max(options.solver.cost_tolerance, _ROBUST_COST_TOLERANCE))
-    return solve(block, losses=options.losses, options=solver, start=state).state
+    return solve(hand.block, losses=options.losses, options=solver, start=state, prepared=hand.prepared).state
+
+
+def _without_wrong(
+    hand: _InHand, state: State, found: Quality, search: CoherentSearch, options: BlockOptions, solve: Solve
+) -> tuple[_InHand, State, CoherentSearch, tuple[RejectedConstraint, ...]]:
+    """What is named is taken out, but for what agrees with the rest once the others are out, and so are single gross
+    contradictions. state, found: before that, of the same constraints."""
+    lacking = hand
+    if search.blocks:
+        lacking = hand.given(without_named(hand.block, search))
+        state = _robust_state(lacking, state, options, solve)
+        found = lacking.quality(state)
+    wrong = Contradictions.of(lacking.block, found.constraints, _gross(options))
+    named_before = named_rows(hand.block, search)
+    search = settled(
+        *(search, hand.block, state, found.cofactors, found.images.points),
+        probability=options.gate_probability,
+        reference_m=options.reference_m,
+    )
+    poses, points = named_rows(hand.block, search)
+    names = {name_of(hand.block, KINDS_OF_POSE[0], int(row)) for row in np.flatnonzero(poses)}
+    names |= {name_of(hand.block, AUTOMATIC, int(row)) for row in np.flatnonzero(points)}
+    poses[np.flatnonzero(~named_before[0])[wrong.poses]] = True
+    points[np.flatnonzero(~named_before[1])[wrong.points]] = True
+    block = replace(
+        wrong.without(lacking.block),
+        pose_priors=hand.block.pose_priors.take(~poses),
+        point_priors=hand.block.point_priors.take(~points),
+    )
+    single = tuple(r for r in wrong.rejected if r.kind not in (KINDS_OF_POSE[0], AUTOMATIC) or r.name not in names)
+    return hand.given(block), state, search, single
+
+
+def _gross(options: BlockOptions) -> float:
+    return 1.0 - _GROSS * (1.0 - options.gate_probability)
+
+
+def _refined(
+    hand: _InHand, state: State, options: BlockOptions, solve: Solve
+) -> tuple[_InHand, BlockSolution, Quality, tuple[RejectedConstraint, ...]]:
+    """Solutions without robust losses and gates by turns, until a gate changes nothing."""
+    rough = replace(options.solver, step_tolerance=max(options.solver.step_tolerance, _GATED_STEP))
+    hand, solution, found = _rescaled(*_solved(hand, state, rough, solve), rough, solve)
+    rejected, solver, settled = (), rough, _SETTLED_SHARE * len(hand.block.observations)
+    for _ in range(_GATE_ROUNDS):
+        wrong = Contradictions.of(hand.block, found.constraints, options.gate_probability)
+        gated = hand.given(wrong.without(hand.block)).gated(found, options.gate_probability)
+        if not wrong.rejected and len(hand.block.observations) - len(gated.block.observations) <= settled:
+            break
+        rejected, solver = rejected + wrong.rejected, options.solver
+        hand, solution, found = _solved(gated, solution.state, solver, solve)
+    if solver is rough:
+        solution = solve(hand.block, options=options.solver, start=solution.state, prepared=hand.prepared)
+    return (*_rescaled(hand, solution, found, options.solver, solve), rejected)
+
+
+def _solved(hand: _InHand, state: State, solver: SolverOptions, solve: Solve) -> tuple[_InHand, BlockSolution, Quality]:
+    solution = solve(hand.block, options=solver, start=state, prepared=hand.prepared)
+    return hand, solution, hand.quality(solution.state)
+
+
+def _rescaled(
+    hand: _InHand, solution: BlockSolution, found: Quality, solver: SolverOptions, solve: Solve
+) -> tuple[_InHand, BlockSolution, Quality]:
+    """The image sigmas brought to what the residuals show, the solution for them and its quality."""
+    component = found.components.get(IMAGE_OBSERVATIONS)
+    factor = None if component is None else component.factor
+    if factor is None or abs(factor - 1.0) < _FACTOR_TOLERANCE:
+        return hand, solution, found
+    return _solved(hand.scaled(factor), solution.state, solver, solve)
 
 
 def _scaled(block: Block, factor: float) -> Block:
@@ -162,40 +218,3 @@ def _scaled(block: Block, factor: float) -> Block:
     weight = np.where(automatic, factor**-2, 1.0)[:, None, None]
     given = replace(priors, information=priors.information * weight)
     return replace(block, observations=block.observations.scaled(factor), point_priors=given)
-
-
-def _gate_images(block: Block, found: Quality, probability: float) -> tuple[Block, int]:
-    """The block without image observations that contradict the rest, and how many they are."""
-    bad = found.images.rejected(probability, found.images.scale)
-    return replace(block, observations=block.observations.take(~bad)), int(bad.sum())
-
-
-def _coherent(block: Block, state: State, options: BlockOptions) -> CoherentSearch:
-    """Wrong stretches of poses at the robust solution: poses with their full weight, all else with that of its loss, so
-    that its single blunders do not bend the network."""
-    losses = {kind: scale for kind, scale in options.losses.items() if kind != POSE_PRIORS}
-    lin = normal_equations(block, state, losses=losses)
-    system = pose_shifts(block, state, _inverted(block, state, lin), lin.reduced.gradient)
-    if system is None:
-        return CoherentSearch((), False)
-    return coherent_blocks(block, system, reference_m=options.reference_m)
-
-
-def _without_rows(block: Block, search: CoherentSearch) -> Block:
-    keep = np.ones(len(block.pose_priors), bool)
-    for wrong in search.blocks:
-        keep[wrong.rows] = False
-    return replace(block, pose_priors=block.pose_priors.take(keep))
-
-
-def _rescaled(
-    block: Block, solution: BlockSolution, scale: float, found: Quality, options: BlockOptions, solve: Solve
-) -> tuple[Block, BlockSolution, float, Quality]:
-    """The image sigmas brought to what the residuals show, the solution for them and its quality."""
-    component = found.components.get(IMAGE_OBSERVATIONS)
-    factor = None if component is None else component.factor
-    if factor is None or abs(factor - 1.0) < _FACTOR_TOLERANCE:
-        return block, solution, scale, found
-    block = _scaled(block, factor)
-    solution = solve(block, options=options.solver, start=solution.state)
-    return block, solution, scale * factor, quality(block, solution.state)

@@ -203,6 +203,7 @@ class ReferenceRays:
     reference: Indices  # (n,)
     by_reference_pose: Array  # (n, 3, 6) derivative of the given coordinates by the error of the reference
     errors: ReferenceErrors  # of the R references
+    image_ids: tuple[str, ...] = ()  # names of the R references; none: nobody asks
 
 
 @dataclass(frozen=True, eq=False)

@@ -25,36 +25,48 @@ class RejectedConstraint:
     dof: int
 
 
-def without_contradictions(
-    block: Block, tests: list[TermTests], probability: float
-) -> tuple[Block, tuple[RejectedConstraint, ...]]:
-    """The block without constraints that fail their test at a probability that good ones pass."""
-    rejected: list[RejectedConstraint] = []
-    drop: dict[str, NDArray[np.bool_]] = {
-        "poses": np.zeros(len(block.pose_priors), bool),
-        "points": np.zeros(len(block.point_priors), bool),
-        POSITION_PRIORS: np.zeros(len(block.position_priors), bool),
-        RELATIVE_POSES: np.zeros(len(block.relative_poses), bool),
-        DISTANCES: np.zeros(len(block.distances), bool),
-    }
-    for test in tests:
-        if test.name not in GATED:
-            continue
-        part = "poses" if test.name in KINDS_OF_POSE else "points" if test.name in KINDS_OF_POINT else test.name
-        for k in np.flatnonzero(test.rejected(probability)):
-            row = int(test.row[k])
-            drop[part][row] = True
-            name = name_of(block, test.name, row)
-            rejected.append(RejectedConstraint(test.name, name, float(test.statistic[k]), int(test.dof[k])))
-    kept = replace(
-        block,
-        pose_priors=block.pose_priors.take(~drop["poses"]),
-        point_priors=block.point_priors.take(~drop["points"]),
-        position_priors=block.position_priors.take(~drop[POSITION_PRIORS]),
-        relative_poses=block.relative_poses.take(~drop[RELATIVE_POSES]),
-        distances=block.distances.take(~drop[DISTANCES]),
-    )
-    return kept, tuple(rejected)
+@dataclass(frozen=True, eq=False)
+class Contradictions:
+    """What fails its test: masks over the lists of a block, and what it was."""
+
+    poses: NDArray[np.bool_]
+    points: NDArray[np.bool_]
+    positions: NDArray[np.bool_]
+    motions: NDArray[np.bool_]
+    distances: NDArray[np.bool_]
+    rejected: tuple[RejectedConstraint, ...]
+
+    @staticmethod
+    def of(block: Block, tests: list[TermTests], probability: float) -> Contradictions:
+        """Constraints that fail their test at a probability that good ones pass."""
+        rejected: list[RejectedConstraint] = []
+        drop: dict[str, NDArray[np.bool_]] = {
+            "poses": np.zeros(len(block.pose_priors), bool),
+            "points": np.zeros(len(block.point_priors), bool),
+            POSITION_PRIORS: np.zeros(len(block.position_priors), bool),
+            RELATIVE_POSES: np.zeros(len(block.relative_poses), bool),
+            DISTANCES: np.zeros(len(block.distances), bool),
+        }
+        for test in tests:
+            if test.name not in GATED:
+                continue
+            part = "poses" if test.name in KINDS_OF_POSE else "points" if test.name in KINDS_OF_POINT else test.name
+            for k in np.flatnonzero(test.rejected(probability)):
+                row = int(test.row[k])
+                drop[part][row] = True
+                name = name_of(block, test.name, row)
+                rejected.append(RejectedConstraint(test.name, name, float(test.statistic[k]), int(test.dof[k])))
+        return Contradictions(*drop.values(), rejected=tuple(rejected))
+
+    def without(self, block: Block) -> Block:
+        return replace(
+            block,
+            pose_priors=block.pose_priors.take(~self.poses),
+            point_priors=block.point_priors.take(~self.points),
+            position_priors=block.position_priors.take(~self.positions),
+            relative_poses=block.relative_poses.take(~self.motions),
+            distances=block.distances.take(~self.distances),
+        )
 
 
 def name_of(block: Block, kind: str, row: int) -> str:

@@ -1,45 +1,54 @@
-"""Coherent blocks of wrong priors: stretches of the trajectory whose given poses share one shift.
+"""Coherent blocks of what is given wrong: stretches of the drive whose given poses or points share one shift.
 
 Every contiguous run of segments is tested for a common shift; the most significant one is taken, the search repeated
-with its shift estimated along, until none is left. The pieces that the runs cut the trajectory into are then tested
+with its shift estimated along, until none is left. The pieces that the runs cut the drive into are then tested
 together, so that an overlap or a good piece inside a run comes out right.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from functools import cache
 from itertools import pairwise
+from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
+from scipy.optimize import brentq
+from scipy.stats import chi2, ncx2
 
-from georef.estimation.adjustment.block import Block, Indices, State
-from georef.estimation.adjustment.cofactors import Cofactors
-from georef.estimation.adjustment.constraint_terms import POSE_PRIORS, constraint_terms
-from georef.estimation.adjustment.group_tests import fitted_cofactor
-from georef.estimation.adjustment.shift_system import ShiftSystem
+from georef.estimation.adjustment.block import Block, Indices
+from georef.estimation.adjustment.kernels_shift import best_run
+from georef.estimation.adjustment.shift_system import Members, ShiftSystem
 from georef.geometry.rigid import Array
 
 _FALSE_ALARM = 0.001  # of a whole search
 _RUNS_A_SEGMENT = 10.0  # so many of the runs through a segment count as independent
 _MOST_RUNS = 100
-_LARGE_SHARE = 0.5  # of those that are left: so many priors of one other shift may be the right ones as well
+_POWER = 0.8  # that a detectable shift is found with: 1 - beta0
+FEWEST_POINTS = 3  # one or two that are off are single blunders
+_LARGE_SHARE = 0.5  # of those that are left: so many of one other shift may be the right ones as well
+Run = tuple[int, int]
 
 
 @dataclass(frozen=True, eq=False)
 class CoherentBlock:
-    """Priors of neighbouring stations that are wrong by one shift.
+    """Given poses or points of neighbouring stations that are wrong by one shift.
 
-    rows: of the block's pose priors; shift_m: given minus adjusted (3,), in world, with its covariance (3, 3);
-    statistic: chi-square with 3 degrees of freedom if the shift were nothing but what references may share.
+    poses, points: rows of the block's priors; references: images of the reference that these points come from;
+    shift_m: given minus adjusted (3,), in world, with its covariance (3, 3); statistic: chi-square with 3 degrees of
+    freedom if the shift were nothing but what references may share (of the clearer part where two were joined);
+    detectable_m: the least shift in its direction that the search finds with a probability of 0.8.
     """
 
     station_ids: tuple[str, ...]
-    rows: Indices
+    poses: Indices
+    points: Indices
+    references: tuple[str, ...]
     shift_m: Array
     cov: Array
     statistic: float
+    detectable_m: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,131 +60,91 @@ class CoherentSearch:
 
 
 def coherent_blocks(block: Block, system: ShiftSystem, *, reference_m: float = 0.01) -> CoherentSearch:
-    """Names the stretches of wrong priors. reference_m: 1-sigma of the errors that right priors of a stretch may have
-    in common (those of the reference images they were localized against)."""
-    limit = float(chi2.isf(_FALSE_ALARM / (_RUNS_A_SEGMENT * len(system)), 3))
-    runs: list[tuple[int, int]] = []
-    while len(runs) < _MOST_RUNS:
-        run, statistic = _best_run(system.given(_design(runs, len(system))), reference_m**2)
-        if statistic <= limit or run in runs:
-            break
-        runs.append(run)
-    pieces = _joined(system, _wrong_pieces(system, runs, reference_m**2, limit), limit)
+    """Names the stretches of what is given wrong. reference_m: 1-sigma of the errors that what is right in a stretch
+    may have in common (those of the reference images it was localized against)."""
+    shared, limit = reference_m**2, search_limit(len(system))
+    pieces = _joined(system, _wrong_pieces(system, _runs(system, shared, limit), shared, limit), limit)
     if not pieces:
         return CoherentSearch((), False)
-    shifts, cov, _ = system.estimate(_design(pieces, len(system)))
-    blocks = [
-        _named(block, system, piece, shifts[k], cov[3 * k : 3 * k + 3, 3 * k : 3 * k + 3], reference_m)
-        for k, piece in enumerate(pieces)
-    ]
-    return CoherentSearch(tuple(blocks), _undecidable(system, pieces, shifts, cov, limit))
+    shifts, cov, _ = _of_pieces(system, pieces).estimate(np.eye(len(pieces)))
+    named = tuple(
+        _named(block, system, piece, shifts[k], _own(cov, k, k), shared, limit) for k, piece in enumerate(pieces)
+    )
+    return CoherentSearch(named, _undecidable(system, pieces, limit))
 
 
-def without_agreeing(
-    search: CoherentSearch, block: Block, state: State, found: Cofactors, probability: float
-) -> CoherentSearch:
-    """The search without poses that agree with the rest after all, such as one right pose at the station where a
-    stretch ends: those that pass their own test, and better so than with the shift of their block taken off.
-
-    block has all poses, state and found (its cofactors) are those of the adjustment that lacks the named ones.
-    """
-    blocks = []
-    for wrong in search.blocks:
-        given, priors = _deleted_statistics(block, state, found, wrong, 0.0), len(wrong.rows)
-        corrected = _deleted_statistics(block, state, found, wrong, 1.0)
-        stays = (given > chi2.ppf(probability, 6)) | (given > corrected)
-        if stays.sum() < priors:
-            rows = wrong.rows[stays]
-            stations = np.unique(block.station[block.pose_priors.image[rows]])
-            wrong = replace(wrong, rows=rows, station_ids=tuple(block.station_ids[i] for i in stations))
-        blocks += [wrong] if len(wrong.rows) else []
-    return CoherentSearch(tuple(blocks), search.undecidable)
+def search_limit(segments: int) -> float:
+    """What the statistic of a shift (3 degrees of freedom) has to exceed in a search over so many segments."""
+    return float(chi2.isf(_FALSE_ALARM / (_RUNS_A_SEGMENT * max(segments, 1)), 3))
 
 
-def _deleted_statistics(block: Block, state: State, found: Cofactors, wrong: CoherentBlock, share: float) -> Array:
-    """r' (S + A Q A')^-1 r (k,) of poses that the adjustment lacks, this share of their shift taken off."""
-    poses = block.pose_priors.take(np.isin(np.arange(len(block.pose_priors)), wrong.rows))
-    back = replace(poses.world_from_cam, translation=poses.world_from_cam.translation - share * wrong.shift_m)
-    only = replace(block, pose_priors=replace(poses, world_from_cam=back))
-    (term,) = (t for t in constraint_terms(only, state, found.layout) if t.name == POSE_PRIORS)
-    cov = np.eye(6) + fitted_cofactor(term, found)
-    return np.einsum("ki,ki->k", term.residual, np.linalg.solve(cov, term.residual[:, :, None])[:, :, 0])
+def _runs(system: ShiftSystem, shared: float, limit: float) -> list[Run]:
+    """Significant runs, the most significant first, each once those before are estimated along."""
+    runs: list[Run] = []
+    while len(runs) < _MOST_RUNS:
+        information, right = np.ascontiguousarray(system.information), np.ascontiguousarray(system.right)
+        found = [best_run(information, right, *span, shared) for span in system.spans]
+        begin, end, statistic = max(found, key=lambda run: run[2], default=(0, 0, 0.0))
+        if statistic <= limit or (begin, end) in runs:
+            break
+        runs.append((begin, end))
+        design = np.zeros((len(system), 1))
+        design[begin:end] = 1.0
+        system = system.given(design)
+    return runs
 
 
-def _design(runs: list[tuple[int, int]], count: int) -> Array:
-    out = np.zeros((count, len(runs)))
-    for k, (begin, end) in enumerate(runs):
-        out[begin:end, k] = 1.0
-    return out
-
-
-def _best_run(system: ShiftSystem, shared: float) -> tuple[tuple[int, int], float]:
-    """The run of segments whose common shift is most significant, against a variance that right ones may share."""
-    count = len(system)
-    sums = np.zeros((count + 1, count + 1, 3, 3))
-    blocks = system.information.reshape(count, 3, count, 3).transpose(0, 2, 1, 3)
-    sums[1:, 1:] = blocks.cumsum(axis=0).cumsum(axis=1)
-    right = np.concatenate([np.zeros((1, 3)), system.right.reshape(-1, 3).cumsum(axis=0)])
-    best, found = (0, count), -1.0
-    ends = np.arange(count + 1)
-    for begin in range(count):
-        end = ends[begin + 1 :]
-        information = sums[end, end] - sums[begin, end] - sums[end, begin] + sums[begin, begin]
-        statistic = _significance(information, right[end] - right[begin], shared)
-        k = int(np.argmax(statistic))
-        if statistic[k] > found:
-            best, found = (begin, int(end[k])), float(statistic[k])
-    return best, found
-
-
-def _significance(information: Array, right: Array, shared: float) -> Array:
-    """s' (M^-1 + shared I)^-1 s of shifts s = M^-1 b (k, 3): by b' (M + shared M M)^-1 b, which a datum that rests on
-    the tested priors alone leaves finite."""
-    scale = np.trace(information, axis1=1, axis2=2)[:, None, None]
-    matrix = information + shared * information @ information + (1e-9 * np.abs(scale) + 1e-12) * np.eye(3)
-    return np.einsum("ki,ki->k", right, np.linalg.solve(matrix, right[:, :, None])[:, :, 0])
-
-
-def _wrong_pieces(
-    system: ShiftSystem, runs: list[tuple[int, int]], shared: float, limit: float
-) -> list[tuple[int, int]]:
+def _wrong_pieces(system: ShiftSystem, runs: list[Run], shared: float, limit: float) -> list[Run]:
     """Pieces between the ends of runs whose own shift stays significant when those of all others are estimated along;
-    what was good inside a run is let go, least significant first."""
-    cuts = sorted({end for run in runs for end in run})
+    what was good inside a run is let go, least significant first, and so are too few points."""
+    cuts = sorted({end for run in runs for end in run} | {end for span in system.spans for end in span})
     pieces = [(a, b) for a, b in pairwise(cuts) if any(begin <= a and b <= end for begin, end in runs)]
-    while pieces:
-        shifts, cov, _ = system.estimate(_design(pieces, len(system)))
+    of_points = np.bincount(system.points.segment, minlength=len(system))
+    of_poses = np.bincount(system.poses.segment, minlength=len(system))
+    pieces = [(a, b) for a, b in pieces if of_poses[a:b].sum() or of_points[a:b].sum() >= FEWEST_POINTS]
+    every, kept = _of_pieces(system, pieces), np.arange(len(pieces))
+    while len(kept):
+        shifts, cov, _ = every.estimate(np.eye(len(pieces))[:, kept])
         statistic = np.array([_squared(s, _own(cov, k, k) + shared * np.eye(3)) for k, s in enumerate(shifts)])
         if statistic.min() > limit:
-            return pieces
-        pieces.pop(int(np.argmin(statistic)))
-    return pieces
+            break
+        kept = np.delete(kept, int(np.argmin(statistic)))
+    return [pieces[k] for k in kept]
 
 
-def _joined(system: ShiftSystem, pieces: list[tuple[int, int]], limit: float) -> list[tuple[int, int]]:
+def _of_pieces(system: ShiftSystem, pieces: list[Run], *, rest: bool = False) -> ShiftSystem:
+    """The system of pieces, and of all that is in none of them as the last one if asked for."""
+    group = np.full(len(system), len(pieces) if rest else -1)
+    for k, (begin, end) in enumerate(pieces):
+        group[begin:end] = k
+    return system.grouped(group, len(pieces) + rest)
+
+
+def _joined(system: ShiftSystem, pieces: list[Run], limit: float) -> list[Run]:
     """Adjoining pieces of the same shift made one."""
-    k = 0
+    k, starts = 0, {begin for begin, _ in system.spans}
     while k + 1 < len(pieces):
-        shifts, cov, _ = system.estimate(_design(pieces, len(system)))
+        shifts, cov, _ = _of_pieces(system, pieces).estimate(np.eye(len(pieces)))
         difference = _own(cov, k, k) + _own(cov, k + 1, k + 1) - _own(cov, k, k + 1) - _own(cov, k + 1, k)
-        if pieces[k][1] == pieces[k + 1][0] and _squared(shifts[k] - shifts[k + 1], difference) <= limit:
+        adjoining = pieces[k][1] == pieces[k + 1][0] and pieces[k][1] not in starts
+        if adjoining and _squared(shifts[k] - shifts[k + 1], difference) <= limit:
             pieces[k : k + 2] = [(pieces[k][0], pieces[k + 1][1])]
         else:
             k += 1
     return pieces
 
 
-def _undecidable(system: ShiftSystem, pieces: list[tuple[int, int]], shifts: Array, cov: Array, limit: float) -> bool:
-    """Whether some pieces of one shift may as well be right and all unnamed priors wrong: that explains the residuals
-    no worse, and there are not many more of the latter."""
-    design, per_segment = _design(pieces, len(system)), np.bincount(system.segment, minlength=len(system))
-    rest = ~design.any(axis=1)
-    explained = system.estimate(design)[2]
-    for k in range(len(pieces)):
+def _undecidable(system: ShiftSystem, pieces: list[Run], limit: float) -> bool:
+    """Whether some pieces of one shift may as well be right and all unnamed ones wrong: that explains the residuals no
+    worse, and there are not many more of the latter."""
+    grouped, last = _of_pieces(system, pieces, rest=True), len(pieces)
+    members, every = grouped.members, np.eye(len(pieces) + 1)
+    shifts, cov, explained = grouped.estimate(every[:, :last])
+    for k in range(last):
         like = _like(shifts, cov, k, limit)
-        if per_segment[design[:, like].any(axis=1)].sum() < _LARGE_SHARE * per_segment[rest].sum():
+        if members[:last][like].sum() < _LARGE_SHARE * members[last]:
             continue
-        other = system.estimate(np.column_stack([design[:, ~like], rest.astype(np.float64)]))[2]
+        other = grouped.estimate(every[:, np.append(~like, True)])[2]
         if other > explained - limit:
             return True
     return False
@@ -199,9 +168,38 @@ def _squared(vector: Array, cov: Array) -> float:
 
 
 def _named(
-    block: Block, system: ShiftSystem, piece: tuple[int, int], shift: Array, cov: Array, reference_m: float
+    block: Block, system: ShiftSystem, piece: Run, shift: Array, cov: Array, shared: float, limit: float
 ) -> CoherentBlock:
-    rows = system.rows[(system.segment >= piece[0]) & (system.segment < piece[1])]
-    stations = np.unique(block.station[block.pose_priors.image[rows]])
-    statistic = _squared(shift, cov + reference_m**2 * np.eye(3))
-    return CoherentBlock(tuple(block.station_ids[i] for i in stations), rows, shift, cov, statistic)
+    poses, points = (_inside(members, piece) for members in (system.poses, system.points))
+    stations = np.unique(np.concatenate([poses.station, points.station]))
+    statistic = _squared(shift, cov + shared * np.eye(3))
+    return CoherentBlock(
+        tuple(block.station_ids[i] for i in stations),
+        *(poses.row, points.row, references_of(block, points.row), shift, cov, statistic),
+        detectable(shift, statistic, limit),
+    )
+
+
+def _inside(members: Members, piece: Run) -> Members:
+    kept = (members.segment >= piece[0]) & (members.segment < piece[1])
+    return Members(members.row[kept], members.station[kept], members.segment[kept])
+
+
+def references_of(block: Block, points: Indices) -> tuple[str, ...]:
+    """Names of the reference images that some rows of the point priors come from; none where the block knows none."""
+    rays = block.reference_rays
+    if rays is None or not rays.image_ids:
+        return ()
+    chosen = np.isin(rays.point, block.point_priors.point[points])
+    return tuple(rays.image_ids[i] for i in np.unique(rays.reference[chosen]))
+
+
+def detectable(shift: Array, statistic: float, limit: float) -> float:
+    """The least shift (m) in the direction of one with this statistic that exceeds a limit with probability _POWER."""
+    return float(np.linalg.norm(shift) * np.sqrt(_noncentrality(limit) / statistic))
+
+
+@cache
+def _noncentrality(limit: float) -> float:
+    """Of a chi-square with 3 degrees of freedom that exceeds a limit with a probability of _POWER."""
+    return cast(float, brentq(lambda at: ncx2.sf(limit, 3, at) - _POWER, 1e-6, 100.0 + 10.0 * limit))

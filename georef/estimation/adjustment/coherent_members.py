@@ -1,0 +1,183 @@
+"""Who belongs to a coherent block: every given pose and point judged by itself, once the named ones are out.
+
+The search works on segments of the drive. At their seams right and wrong ones meet, and a segment that has both shows
+a shift that neither has.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.spatial import KDTree
+from scipy.stats import chi2
+
+from georef.estimation.adjustment.block import KINDS_OF_POSE, Block, Indices, State
+from georef.estimation.adjustment.cofactors import Cofactors
+from georef.estimation.adjustment.coherent import (
+    FEWEST_POINTS,
+    CoherentBlock,
+    CoherentSearch,
+    references_of,
+    search_limit,
+)
+from georef.estimation.adjustment.coherent_clusters import PointOffsets, clusters
+from georef.estimation.adjustment.constraint_terms import POSE_PRIORS, constraint_terms, whitening
+from georef.estimation.adjustment.group_tests import fitted_cofactor
+from georef.geometry.rigid import Array
+
+_SEAM = 3  # stations beyond the ends of a block that may belong to it
+_NEAR_M = 15.0  # between points of one piece of the reference
+_CONTRADICTS = 1e-6  # how seldom a right point is as far off as one of a cluster
+_SAME = 0.9999  # that two estimates of one shift are taken for the same
+
+
+@dataclass(frozen=True, eq=False)
+class _Candidates:
+    """Rows of one kind, their stations, and their statistic of dof degrees of freedom: of some of them (places among
+    the rows) with a shift (3,) of covariance (3, 3) taken off."""
+
+    row: Indices
+    station: Indices
+    dof: int
+    statistic: Callable[[Indices, Array, Array], Array]
+
+
+def settled(
+    search: CoherentSearch,
+    block: Block,
+    state: State,
+    found: Cofactors,
+    points: Array,
+    *,
+    probability: float = 0.999,
+    reference_m: float = 0.01,
+) -> CoherentSearch:
+    """The search with the members of each block told one by one.
+
+    One that agrees with the rest after all, and better so than with the shift of its block, is let go; one that
+    disagrees belongs to the block near by whose shift explains it best. A block of fewer points than a search would
+    name is none; contradicting points that belong to none may form one by themselves (`coherent_clusters`). block has
+    all priors; state, found and points (P, 3, 3), the cofactors, are those of the adjustment that lacks the named ones.
+    """
+    of_poses, offsets = _poses(block, state, found), PointOffsets.of(block, state, points)
+    of_points = _points(offsets)
+    pose_owner = _owners(of_poses, [wrong.poses for wrong in search.blocks], search.blocks, probability)
+    point_owner = _owners(of_points, [wrong.points for wrong in search.blocks], search.blocks, probability)
+    blocks = []
+    for k, wrong in enumerate(search.blocks):
+        mine, given = pose_owner == k, point_owner == k
+        if not mine.any() and given.sum() < FEWEST_POINTS:
+            point_owner[given] = -1
+            continue
+        stations = np.unique(np.concatenate([of_poses.station[mine], of_points.station[given]]))
+        rows = np.sort(of_points.row[given])
+        names = tuple(block.station_ids[i] for i in stations)
+        references = references_of(block, rows)
+        wrong = replace(wrong, station_ids=names, poses=of_poses.row[mine], points=rows, references=references)
+        blocks.append(wrong)
+    alone = np.flatnonzero((point_owner < 0) & (offsets.squares() > chi2.isf(_CONTRADICTS, 3)))
+    blocks += clusters(block, offsets.take(alone), reference_m**2, search_limit(len(block.station_ids)))
+    return CoherentSearch(tuple(_joined(blocks, block)), search.undecidable)
+
+
+def _joined(blocks: list[CoherentBlock], block: Block) -> list[CoherentBlock]:
+    """Blocks of one kind and of the same shift whose stations adjoin, or whose points lie near each other as those seen
+    from two passages of a street do, made one; in the order of their stations, poses first."""
+    at = {name: i for i, name in enumerate(block.station_ids)}
+    left = sorted(blocks, key=lambda b: (len(b.points) > 0, at[b.station_ids[0]]))
+    out: list[CoherentBlock] = []
+    while left:
+        here = left.pop(0)
+        while (k := next((k for k, b in enumerate(left) if _one_piece(here, b, block, at)), -1)) >= 0:
+            here = _merged(here, left.pop(k), block)
+        out.append(here)
+    return out
+
+
+def _one_piece(a: CoherentBlock, b: CoherentBlock, block: Block, at: dict[str, int]) -> bool:
+    """Whether blocks are of one kind, their shifts may be the same, and nothing is between them."""
+    off, cov = a.shift_m - b.shift_m, a.cov + b.cov
+    if bool(len(a.points)) != bool(len(b.points)) or off @ np.linalg.solve(cov, off) > chi2.ppf(_SAME, 3):
+        return False
+    stations = [np.array([at[name] for name in c.station_ids]) for c in (a, b)]
+    if np.abs(stations[0][:, None] - stations[1]).min() <= _SEAM:
+        return True
+    places = [block.point_priors.position[c.points] for c in (a, b)]
+    return len(a.points) > 0 and float(KDTree(places[0]).query(places[1])[0].min()) <= _NEAR_M
+
+
+def _merged(a: CoherentBlock, b: CoherentBlock, block: Block) -> CoherentBlock:
+    """Both as one, the shifts weighted."""
+    weights = np.linalg.inv(a.cov), np.linalg.inv(b.cov)
+    cov = np.linalg.inv(weights[0] + weights[1])
+    points = np.union1d(a.points, b.points)
+    return CoherentBlock(
+        *(
+            tuple(sorted({*a.station_ids, *b.station_ids}, key=block.station_ids.index)),
+            np.union1d(a.poses, b.poses),
+            points,
+        ),
+        *(references_of(block, points), cov @ (weights[0] @ a.shift_m + weights[1] @ b.shift_m), cov),
+        *(max(a.statistic, b.statistic), min(a.detectable_m, b.detectable_m)),
+    )
+
+
+def _owners(
+    candidates: _Candidates, named: list[Indices], blocks: tuple[CoherentBlock, ...], probability: float
+) -> Indices:
+    """The block (K,) that each candidate belongs to, or -1."""
+    limit, none = float(chi2.ppf(probability, candidates.dof)), np.zeros(3)
+    count = len(candidates.row)
+    given = candidates.statistic(np.arange(count), none, np.zeros((3, 3)))
+    owner, best, own = np.full(count, -1), np.full(count, np.inf), np.full(count, -1)
+    for k, (rows, wrong) in enumerate(zip(named, blocks, strict=True)):
+        mine = np.flatnonzero(np.isin(candidates.row, rows))
+        if not len(mine):
+            continue
+        corrected = candidates.statistic(mine, wrong.shift_m, np.zeros((3, 3)))
+        own[mine[~((given[mine] <= limit) & (given[mine] <= corrected))]] = k
+        first, last = candidates.station[mine].min() - _SEAM, candidates.station[mine].max() + _SEAM
+        near = np.flatnonzero((candidates.station >= first) & (candidates.station <= last) & ~(given <= limit))
+        corrected = candidates.statistic(near, wrong.shift_m, wrong.cov)
+        better = (corrected <= limit) & (corrected < best[near])
+        owner[near[better]], best[near[better]] = k, corrected[better]
+    return np.where(owner >= 0, owner, own)
+
+
+def _poses(block: Block, state: State, found: Cofactors) -> _Candidates:
+    """r' (S + A Q A')^-1 r of localized poses that the adjustment lacks."""
+    priors = block.pose_priors
+    row = np.flatnonzero(priors.kind == KINDS_OF_POSE.index("localized"))
+
+    def statistic(chosen: Indices, shift: Array, shift_cov: Array) -> Array:
+        if not len(chosen):
+            return np.zeros(0)
+        taken = priors.take(_mask(row[chosen], len(priors)))
+        back = replace(taken.world_from_cam, translation=taken.world_from_cam.translation - shift)
+        only = replace(block, pose_priors=replace(taken, world_from_cam=back))
+        (term,) = (t for t in constraint_terms(only, state, found.layout) if t.name == POSE_PRIORS)
+        by_shift = whitening(taken.cov)[:, :, 3:] @ np.swapaxes(back.rotation, 1, 2)
+        cov = np.eye(6) + fitted_cofactor(term, found) + by_shift @ shift_cov @ np.swapaxes(by_shift, 1, 2)
+        return _squares(term.residual, cov)
+
+    return _Candidates(row, block.station[block.pose_priors.image[row]], 6, statistic)
+
+
+def _points(offsets: PointOffsets) -> _Candidates:
+    """The same of automatic GCPs."""
+    return _Candidates(
+        *(offsets.row, offsets.station, 3),
+        lambda chosen, shift, shift_cov: offsets.take(chosen).squares(shift, shift_cov),
+    )
+
+
+def _squares(residual: Array, cov: Array) -> Array:
+    return np.einsum("ki,ki->k", residual, np.linalg.solve(cov, residual[:, :, None])[:, :, 0])
+
+
+def _mask(rows: Indices, count: int) -> Array:
+    out = np.zeros(count, bool)
+    out[rows] = True
+    return out
