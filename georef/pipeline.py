@@ -95,7 +95,7 @@ def _uses_tracks(config: Config) -> bool:
 
 STAGES: tuple[Stage, ...] = (
     Stage("features", 2, ("features",), all_images, (), features.run),
-    Stage("network", 4, _NETWORK_KEYS, reference_with_images, (), network.run, of_reference=True),
+    Stage("network", 5, _NETWORK_KEYS, reference_with_images, (), network.run, of_reference=True),
     Stage("index", 1, ("retrieval",), reference_with_images, (), index.run, _uses_index, of_reference=True),
     Stage(
         "global-map", 2, _MAP_KEYS, reference_with_images, ("network",), global_map.run, _uses_map, of_reference=True

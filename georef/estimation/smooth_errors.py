@@ -22,10 +22,10 @@ from scipy.linalg import cho_factor, cho_solve
 from scipy.optimize import minimize
 from scipy.stats import chi2
 
-from georef.estimation.adjustment.posterior import Posterior
-from georef.estimation.adjustment.problem import Problem
-from georef.estimation.adjustment.solve import Solution
+from georef.estimation.adjustment.block import Block, State
+from georef.estimation.adjustment.cofactors import Cofactors
 from georef.geometry.rigid import Array
+from georef.types.results import ReferenceNoise
 
 _NEAREST = 4  # images that one shares most points with
 # Of the correlation, in usual distances to those: well beyond the ten images that a localization rests on, or what is
@@ -60,27 +60,22 @@ class Residuals:
     shared: NDArray[np.integer]  # (M, M) points that both see
 
     @staticmethod
-    def of(problem: Problem, solution: Solution, cofactors: Posterior) -> Residuals:
-        count = len(problem.image_ids)
-        rotations = np.array([pose.rotation for pose in solution.world_from_cams])
-        positions = np.array([pose.translation for pose in solution.world_from_cams])
-        values, to_units = np.zeros((count, 6)), np.zeros((6 * count, 6 * count))
-        for index, given in problem.orientations.items():
-            sigma = np.concatenate([given.rotation_sigma_rad, given.position_sigma_m])
-            turned = np.kron(np.eye(2), rotations[index]) / sigma[:, None]
-            values[index] = turned @ solution.world_from_cams[index].local(given.world_from_cam)
-            to_units[6 * index : 6 * index + 6, 6 * index : 6 * index + 6] = turned
-        seen = np.zeros((count, len(problem.points)), np.int32)
-        seen[problem.observations.view, problem.observations.point] = 1
-        shared = seen @ seen.T
-        np.fill_diagonal(shared, 0)
-        trace = np.einsum("aij,bij->ab", rotations, rotations)
+    def of(block: Block, state: State, cofactors: Cofactors, noise: ReferenceNoise) -> Residuals:
+        """Of a network of images that are stations by themselves, each with a given orientation of this noise."""
+        count, poses = len(block.image_ids), block.world_from_cam(state)
+        to_units = np.zeros((count, 6, 6))
+        to_units[:, :3, :3] = poses.rotation / np.array(noise.rotation_sigma_rad)[:, None]
+        to_units[:, 3:, 3:] = poses.rotation / np.array(noise.position_sigma_m)[:, None]
+        given = block.pose_priors.world_from_cam.take(np.argsort(block.pose_priors.image))
+        joint = cofactors.joint_stations(block.station).reshape(count, 6, count, 6)
+        in_units = np.einsum("aij,ajbk,blk->aibl", to_units, joint, to_units, optimize=True)
+        trace = np.einsum("aij,bij->ab", poses.rotation, poses.rotation)
         return Residuals(
-            values.ravel(),
-            to_units @ cofactors.poses @ to_units.T,
-            np.linalg.norm(positions[:, None] - positions, axis=2),
+            np.einsum("aij,aj->ai", to_units, poses.local(given)).ravel(),
+            in_units.reshape(6 * count, 6 * count),
+            np.linalg.norm(poses.translation[:, None] - poses.translation, axis=2),
             np.arccos(np.clip((trace - 1.0) / 2.0, -1.0, 1.0)),
-            shared,
+            _shared_points(block),
         )
 
     def usual(self, between: Array) -> float:
@@ -88,6 +83,16 @@ class Residuals:
         nearest = np.argsort(-self.shared, axis=1, kind="stable")[:, :_NEAREST]
         some = np.take_along_axis(self.shared, nearest, axis=1) > 0
         return float(np.median(np.take_along_axis(between, nearest, axis=1)[some]))
+
+
+def _shared_points(block: Block) -> NDArray[np.integer]:
+    """How many points each two images (M, M) both see."""
+    obs = block.observations
+    seen = np.zeros((len(block.image_ids), len(block.points)), np.int32)
+    seen[obs.view, obs.point] = 1
+    shared = seen @ seen.T
+    np.fill_diagonal(shared, 0)
+    return shared
 
 
 def smooth_errors(residuals: Residuals, position_sigma_m: float, rotation_sigma_rad: float) -> SmoothErrors | None:

@@ -53,7 +53,7 @@ def test_planted_blunders_are_rejected() -> None:
     for seed in range(300, 310):
         block = street_block(seed, noise=noise)
         adjusted = adjusted_block(block)
-        obs = adjusted.problem.observations
+        obs = adjusted.block.observations
         planted += len(block.planted)
         left += len(block.planted & set(zip(obs.view.tolist(), obs.keypoint.tolist(), strict=True)))
         means.append(block.judged(adjusted).nees["joint"])

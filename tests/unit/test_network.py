@@ -11,21 +11,19 @@ import pytest
 
 from georef.config import AdjustConfig, NetworkConfig
 from georef.errors import StageError
-from georef.estimation.adjustment.problem import Problem
-from georef.estimation.adjustment.solve import Solution
 from georef.estimation.guided import GuidedOptions, PosedFeatures
 from georef.estimation.reference_network import (
     NetworkResult,
     choose_images,
     estimate_noise,
     match_network,
-    widening_angle,
 )
 from georef.estimation.tracks import PairMatches, nearest_ray_angles
+from georef.estimation.widening import widening_angle
 from georef.executor import Silent
 from georef.geometry.angles import rotation_from_yaw_pitch_roll
 from georef.geometry.projection import Views
-from georef.geometry.rigid import Rigid3
+from georef.geometry.rigid import Array, Rigid3
 from georef.geometry.triangulation import triangulate
 from georef.types.results import ReferenceNoise
 from georef.types.scene import Observations
@@ -158,7 +156,7 @@ def test_chosen_images_lie_together() -> None:
     np.testing.assert_array_equal(choose_images(positions[:5], 11), np.arange(5))
 
 
-def around(rng: np.random.Generator, widening_rad: float, count: int = 3000) -> tuple[Problem, Solution]:
+def around(rng: np.random.Generator, widening_rad: float, count: int = 3000) -> tuple[Array, Observations, Views]:
     """Points seen by two to four of the cameras on an arc about them, noise growing with the angle between rays."""
     yaw = np.radians(np.sort(rng.uniform(-70, 70, 40)))
     poses = []
@@ -180,10 +178,7 @@ def around(rng: np.random.Generator, widening_rad: float, count: int = 3000) -> 
     sigma = 0.5 * wide.widening(nearest_ray_angles(points, exact, centres))
     pixel = exact.pixel + sigma[:, None] * rng.normal(size=(len(point), 2))
     solved = triangulate(views, point, view, pixel, exact.sigma_px, count)
-    observations = Observations(point, view, pixel, exact.sigma_px, exact.keypoint)
-    names = tuple(str(i) for i in range(40))
-    problem = Problem(names, (CAMERA,) * 40, tuple(poses), solved.points, observations)
-    return problem, Solution(tuple(poses), solved.points, np.zeros((0, 3)), 1, True)
+    return solved.points, Observations(point, view, pixel, exact.sigma_px, exact.keypoint), views
 
 
 @pytest.mark.parametrize("true_deg", [5.0, 15.0, 40.0])

@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
 
 from georef.config import AdjustConfig
-from georef.estimation.adjustment.problem import AutomaticGcps, Orientation, Problem
-from georef.estimation.adjustment.solve import Solution
+from georef.estimation.adjustment import block as adjustment
+from georef.estimation.adjustment.block import KINDS_OF_POSE, PosePriors
+from georef.estimation.adjustment.problem import AutomaticGcps, Problem
 from georef.estimation.epoch_problem import epoch_problem
 from georef.estimation.tracks import PairMatches
 from georef.geometry.camera import Camera, project
+from georef.geometry.poses import Poses
 from georef.geometry.rigid import Array, Rigid3
 from georef.types.campaign import PosePrior, PositionPrior
 from georef.types.constraints import ControlPoint, Mark
@@ -41,10 +43,9 @@ class Block:
     world: World
     problem: Problem
 
-    def errors(self, solution: Solution) -> Array:
+    def errors(self, poses: Sequence[Rigid3]) -> Array:
         """Errors (6M,) of all poses, estimated minus true."""
-        poses = zip(self.world.queries, solution.world_from_cams, strict=True)
-        return np.concatenate([truth.local(estimate) for truth, estimate in poses])
+        return np.concatenate([truth.local(pose) for truth, pose in zip(self.world.queries, poses, strict=True)])
 
 
 def block(
@@ -124,13 +125,25 @@ def pose_priors(world: World, rng: np.random.Generator, bad: Collection[int] = (
     return out
 
 
-def orientations(world: World, rng: np.random.Generator, sigma_m: float, sigma_rad: float) -> dict[int, Orientation]:
+def orientations(world: World, rng: np.random.Generator, sigma_m: float, sigma_rad: float) -> PosePriors:
     """Given exterior orientations of all new images."""
     noise = ReferenceNoise(1.0, (sigma_m, sigma_m, sigma_m), (sigma_rad, sigma_rad, sigma_rad), "declared")
-    return {
-        i: Orientation(disturbed(pose, noise, rng), np.full(3, sigma_m), np.full(3, sigma_rad))
-        for i, pose in enumerate(world.queries)
-    }
+    given = [disturbed(pose, noise, rng) for pose in world.queries]
+    every = np.arange(len(given))
+    kind = np.full(len(given), KINDS_OF_POSE.index("orientation"))
+    return PosePriors(every, Poses.of(given), np.array([noise.pose_cov(pose) for pose in given]), kind)
+
+
+def with_orientations(whole: adjustment.Block, given: PosePriors, images: Collection[int]) -> adjustment.Block:
+    """A block with the given exterior orientations of some images beside its other priors."""
+    more, there = given.take(np.isin(given.image, list(images))), whole.pose_priors
+    joined = PosePriors(
+        np.concatenate([there.image, more.image]),
+        Poses.of([*there.world_from_cam.to_list(), *more.world_from_cam.to_list()]),
+        np.concatenate([there.cov, more.cov]),
+        np.concatenate([there.kind, more.kind]),
+    )
+    return replace(whole, pose_priors=joined)
 
 
 def control(

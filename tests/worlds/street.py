@@ -14,7 +14,6 @@ from pathlib import Path
 import numpy as np
 
 from georef.config import AdjustConfig
-from georef.estimation.adjustment.adjust import Adjusted, adjust
 from georef.estimation.adjustment.problem import Problem
 from georef.estimation.epoch_problem import epoch_problem
 from georef.estimation.guided import PosedFeatures
@@ -33,6 +32,7 @@ from georef.types.campaign import Campaign, Image, PositionPrior
 from georef.types.constraints import CheckKind, CheckPoint, Mark
 from georef.types.features import Features, Matches
 from georef.types.results import Localized, ReferenceMatches, ReferenceNoise
+from tests.worlds.adjusted import Outcome, adjusted
 from tests.worlds.points import loose_cov
 
 QUALITY = ReferenceQuality(absolute_m=0.0)
@@ -93,16 +93,16 @@ class StreetBlock:
     planted: frozenset[tuple[int, int]]  # (view, keypoint) of blunders in new images
     truth: tuple[Rigid3, ...]  # of the new images, relative to the reference where that is deformed
 
-    def judged(self, adjusted: Adjusted) -> Judged:
+    def judged(self, found: Outcome) -> Judged:
         """Errors of an adjustment of the problem, beside what it predicts of them."""
-        poses = adjusted.solution.world_from_cams
+        poses = tuple(found.poses)
         cameras = tuple(camera_of(image) for image in self.place.new)
         ids = tuple(image.image_id for image in self.place.new)
-        images = PosedImages(ids, cameras, poses, adjusted.posterior.joint)
+        images = PosedImages(ids, cameras, poses, found.joint)
         pairs = [(point, intersect(point, images)) for point in self.check]
-        found = [(point, cut) for point, cut in pairs if isinstance(cut, Intersection)]
+        cuts = [(point, cut) for point, cut in pairs if isinstance(cut, Intersection)]
         pose_error = np.concatenate([t.local(p) for t, p in zip(self.truth, poses, strict=True)])
-        return _judged(pose_error, adjusted.posterior.poses, found, len(ids))
+        return _judged(pose_error, found.cov, cuts, len(ids))
 
 
 @dataclass(frozen=True, eq=False)
@@ -169,8 +169,8 @@ def street_block(
     return StreetBlock(where, problem, _checks(where, deformation, rng), planted, poses)
 
 
-def adjusted_block(block: StreetBlock, config: AdjustConfig | None = None) -> Adjusted:
-    return adjust(block.problem, config or AdjustConfig())
+def adjusted_block(block: StreetBlock, config: AdjustConfig | None = None) -> Outcome:
+    return adjusted(block.problem, config)
 
 
 def stated(noise: ObservationNoise, quality: ReferenceQuality, factor: float = 1.0) -> ReferenceNoise:

@@ -59,14 +59,14 @@ def _nested_dissection(stations: int, row: Indices, column: Indices) -> Indices:
     """METIS, as GTSAM has it."""
     import gtsam
 
-    graph, one, nothing, unit = gtsam.GaussianFactorGraph(), np.eye(1), np.zeros(1), gtsam.noiseModel.Unit.Create(1)
-    for station in range(stations):
-        graph.add(gtsam.JacobianFactor(station, one, nothing, unit))
     apart = row != column
-    for a, b in zip(row[apart].tolist(), column[apart].tolist(), strict=True):
+    tied, ends = np.unique(np.stack([row[apart], column[apart]]), return_inverse=True)
+    alone = np.setdiff1d(np.arange(stations), tied)  # METIS writes beyond its memory for a vertex without edges
+    graph, one, nothing, unit = gtsam.GaussianFactorGraph(), np.eye(1), np.zeros(1), gtsam.noiseModel.Unit.Create(1)
+    for a, b in ends.reshape(2, -1).T.tolist():
         graph.add(gtsam.JacobianFactor(a, one, b, one, nothing, unit))
-    order = gtsam.Ordering.MetisGaussianFactorGraph(graph)
-    return np.array([order.at(i) for i in range(order.size())], dtype=np.int64)
+    order = gtsam.Ordering.MetisGaussianFactorGraph(graph) if len(tied) else gtsam.Ordering()
+    return np.concatenate([alone, tied[[order.at(i) for i in range(order.size())]]]).astype(np.int64)
 
 
 def _fronts(row: Indices, column: Indices, order: Indices) -> list[Front]:

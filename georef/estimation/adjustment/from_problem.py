@@ -21,8 +21,7 @@ from georef.estimation.adjustment.block import (
     ReferenceRays,
     RigCamera,
 )
-from georef.estimation.adjustment.problem import AutomaticGcps, Problem, control_observations
-from georef.estimation.adjustment.solve import control_start
+from georef.estimation.adjustment.problem import AutomaticGcps, Problem, control_observations, control_start
 from georef.geometry.poses import Poses
 from georef.geometry.rigid import Rigid3
 from georef.types.campaign import Mounting

@@ -1,4 +1,7 @@
-"""What an adjustment is given: images, points, observations and weighted constraints. No check point fits in."""
+"""What an epoch gives to its adjustment: images, points, observations and weighted constraints. No check point fits in.
+
+`from_problem` makes the block of it that is adjusted.
+"""
 
 from __future__ import annotations
 
@@ -13,9 +16,12 @@ from georef.geometry.camera import Camera
 from georef.geometry.covariance import pose_cov_from_parts
 from georef.geometry.projection import Views
 from georef.geometry.rigid import Array, Rigid3
+from georef.geometry.triangulation import triangulate
 from georef.types.campaign import PosePrior, PositionPrior
 from georef.types.constraints import ControlPoint
 from georef.types.scene import Observations
+
+_KNOWN_DEPTH = 0.1  # of its distance: a control point whose marks say less starts at its coordinates
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,16 +83,6 @@ class AutomaticGcps:
             by_reference_pose=self.by_reference_pose[rays],
         )
 
-    def scaled(self, factor: float) -> AutomaticGcps:
-        """The same points with their image noise scaled by a factor."""
-        return replace(self, cov=self.cov * factor**2)
-
-    def information(self, count: int) -> Array:
-        """Prior information (count, 3, 3) of all points of the problem, zero for tie points."""
-        out = np.zeros((count, 3, 3))
-        out[self.point] = np.linalg.inv(self.cov)
-        return out
-
 
 @dataclass(frozen=True, eq=False)
 class Problem:
@@ -108,17 +104,6 @@ class Problem:
             raise TypeError("only control points can take part in an adjustment")
         if set(self.orientations) & set(self.pose_priors):
             raise ValueError("an image has either a given exterior orientation or a pose prior")
-
-    @property
-    def views(self) -> Views:
-        return Views.of(self.world_from_cams, self.cameras)
-
-    def with_poses(self, world_from_cams: tuple[Rigid3, ...], points: Array) -> Problem:
-        return replace(self, world_from_cams=world_from_cams, points=points)
-
-    def scaled(self, factor: float) -> Problem:
-        """The same problem with the sigmas of all keypoints scaled, those behind the automatic GCPs included."""
-        return replace(self, observations=self.observations.scaled(factor), gcps=self.gcps.scaled(factor))
 
     def restricted(self, observations: NDArray[np.bool_], gcps: NDArray[np.bool_]) -> Problem:
         """Only the observations and automatic GCPs to keep, and the points that these still determine."""
@@ -160,3 +145,18 @@ def mark_observations(points: Sequence[ControlPoint], image_ids: Sequence[str]) 
         sigma_px=np.array([row[3] for row in rows], dtype=np.float64),
         keypoint=np.full(len(rows), -1, dtype=np.int64),
     )
+
+
+def control_start(problem: Problem) -> Array:
+    """Where control points (C, 3) start: intersected from their marks, so that a robust loss can tell wrong coordinates
+    from wrong marks; at their coordinates where the marks do not say."""
+    marks, given = control_observations(problem), np.array([c.point_in_world for c in problem.control]).reshape(-1, 3)
+    if not len(marks):
+        return given
+    views = Views.of(problem.world_from_cams, problem.cameras)
+    found = triangulate(views, marks.point, marks.view, marks.pixel, marks.sigma_px, len(given))
+    sigma = np.sqrt(np.trace(np.nan_to_num(found.cov), axis1=1, axis2=2))
+    nearest = np.full(len(given), np.inf)
+    np.minimum.at(nearest, marks.point, np.linalg.norm(found.points[marks.point] - views.centres[marks.view], axis=1))
+    known = np.isfinite(found.points).all(axis=1) & (sigma < _KNOWN_DEPTH * nearest)
+    return np.where(known[:, None], found.points, given)
