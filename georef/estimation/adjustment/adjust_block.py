@@ -81,14 +81,14 @@ class AdjustedBlock:
     sigma_scale: float
 
 
-def adjust_block(block: Block, options: BlockOptions) -> AdjustedBlock:
+def adjust_block(block: Block, options: BlockOptions, start: State | None = None) -> AdjustedBlock:
     """Adjusts a block in which observations and constraints may be wrong.
 
-    Image sigmas are scaled by their own variance component; sigmas of constraints are tested and reported, never
-    changed. Raises GeorefError where the constraints leave the datum open.
+    start: another state than the approximate values; the robust stage begins there. Image sigmas are scaled by their
+    own variance component; sigmas of constraints are tested and reported, never changed. Raises GeorefError where the constraints leave the datum open.
     """
     given, gross = block, 1.0 - _GROSS * (1.0 - options.gate_probability)
-    block, state, scale, found = _robust(block, block.start(), options)
+    block, state, scale, found = _robust(block, start or block.start(), options)
     block, _ = _gate_images(block, found, gross)
     search = _coherent(block, state, options)
     if search.blocks:
