@@ -89,10 +89,19 @@ class HoldOut(Section):
 
 
 class BlockComparison(Section):
-    """Another program's calibration of the only camera, which the report compares with."""
+    """Another program's calibrations, which the report compares with: `camera`, a file of one camera or, in the order of
+    the ids in `order`, of several; or `parameters`, a file of the parameters of all images."""
 
     format: Literal["pix4d"]
-    camera: str
+    camera: str | None = None
+    order: tuple[str, ...] | None = None
+    parameters: str | None = None
+
+    @model_validator(mode="after")
+    def _one_file(self) -> BlockComparison:
+        if (self.camera is None) == (self.parameters is None):
+            raise ValueError("name one of: camera, parameters")
+        return self
 
 
 class BlockSection(Section):

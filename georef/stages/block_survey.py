@@ -50,6 +50,10 @@ class BlockSurvey:
     check_kind: CheckKind
     dropped: int
 
+    @property
+    def has_gnss(self) -> bool:
+        return len(self.block.position_priors) > 0
+
     def control(self, ids: Sequence[str]) -> tuple[ControlPoint, ...]:
         return tuple(point for point in self.surveyed if point.point_id in set(ids))
 

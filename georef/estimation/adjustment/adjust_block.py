@@ -84,8 +84,9 @@ class AdjustedBlock:
 def adjust_block(block: Block, options: BlockOptions, start: State | None = None) -> AdjustedBlock:
     """Adjusts a block in which observations and constraints may be wrong.
 
-    start: another state than the approximate values; the robust stage begins there. Image sigmas are scaled by their
-    own variance component; sigmas of constraints are tested and reported, never changed. Raises GeorefError where the constraints leave the datum open.
+    start: another state than the approximate values, where the robust stage begins. Image sigmas are scaled by their
+    own variance component; sigmas of constraints are tested and reported, never changed. Raises GeorefError where the
+    constraints leave the datum open.
     """
     given, gross = block, 1.0 - _GROSS * (1.0 - options.gate_probability)
     block, state, scale, found = _robust(block, start or block.start(), options)
