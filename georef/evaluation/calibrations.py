@@ -24,8 +24,10 @@ class CalibrationDifference:
 
 
 def difference_map(camera: Camera, other: Camera, grid: int = _GRID) -> tuple[Array, Array]:
-    """Pixels (n, 2) of a grid over the image that `other` sees, and what `camera` differs by there (n, 2), px, after the
-    best turn and change of scale."""
+    """Pixels (n, 2) of a grid over the image that `other` sees, and what `camera` differs by there (n, 2), px.
+
+    The best turn of the camera and change of scale are taken off.
+    """
     pixels, rays, difference = _differences(camera, other, grid)
     return pixels, _without_turn_and_scale(difference, rays)
 

@@ -78,7 +78,7 @@ def run(project: Project, name: str, say: Say = lambda _: None) -> BlockRun:
     if survey.surveyed and survey.has_gnss and len(survey.block.drift_information) <= 1:
         say("offset between GNSS and surveyed points")
         report["offset"] = _offset(survey, cleaned, config)
-    if section.hold_out is not None and section.hold_out.control < len(survey.surveyed):
+    if section.hold_out is not None and section.hold_out.control < len(survey.whole):
         say("splits into control and check points")
         report["hold_out"] = hold_out_numbers(survey, cleaned, config, section.hold_out)
     if section.compare is not None:

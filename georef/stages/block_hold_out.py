@@ -28,7 +28,7 @@ def hold_out_numbers(
     differ. Without GNSS each split is adjusted. No split passes gates: none of its check points may be told by results.
     """
     positions = {point.point_id: point.point_in_world[:2] for point in survey.surveyed}
-    names = [point.point_id for point in survey.surveyed if len(point.marks) >= 2]
+    names = [point.point_id for point in survey.whole if len(point.marks) >= 2]
     free = _adjusted(survey, cleaned, config, []) if survey.has_gnss else None
     if free is not None:
         names = [error.point_id for error in free.check.errors.determined]

@@ -60,9 +60,8 @@ def _mark_words(mark: dict[str, Any]) -> str:
 def _component_lines(components: dict[str, Any]) -> Iterator[str]:
     yield f"{'variance components':<22}{'observations':>13}{'redundancy':>12}  estimated over stated sigma"
     for name, part in components.items():
-        factor = (
-            "too little checks it" if part["factor"] is None else f"{part['factor']:.2f} +- {part['factor_sigma']:.2f}"
-        )
+        known = part["factor"] is not None
+        factor = f"{part['factor']:.2f} +- {part['factor_sigma']:.2f}" if known else "too little checks it"
         yield f"{name:<22}{part['observations']:>13}{part['redundancy']:>12.1f}  {factor}"
 
 
@@ -82,7 +81,8 @@ def _gnss_lines(variant: dict[str, Any]) -> Iterator[str]:
     if gnss is None:
         return
     low, middle, high = (cm(values) for values in gnss["detectable_m"])
-    yield f"residuals of GNSS, RMS      {cm(gnss['residual_rms_m'])}; largest w {gnss['largest_w']:.1f} at {gnss['largest_w_of']}"
+    worst = f"largest w {gnss['largest_w']:.1f} at {gnss['largest_w_of']}"
+    yield f"residuals of GNSS, RMS      {cm(gnss['residual_rms_m'])}; {worst}"
     yield f"detectable in GNSS E/N/H    smallest {low}, median {middle}, largest {high}"
 
 

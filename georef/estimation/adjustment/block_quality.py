@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from georef.estimation.adjustment.block import Indices
 from georef.estimation.adjustment.block_solutions import Solved, residuals_px
 from georef.estimation.adjustment.components import Component
 from georef.estimation.adjustment.constraint_terms import POSITION_PRIORS
@@ -23,7 +24,7 @@ class Given:
 
     coordinates: Reliability
     statistic: Array  # (K,)
-    dof: Array  # (K,)
+    dof: Indices  # (K,)
 
 
 @dataclass(frozen=True)

@@ -9,8 +9,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import cast
 
 import numpy as np
+from numpy.typing import NDArray
 
 from georef.config import AdjustConfig
 from georef.estimation.adjustment.adjust_block import AdjustedBlock, BlockOptions, Quality, adjust_block, quality
@@ -40,6 +42,7 @@ class CleanBlock:
     dropped: int  # image observations
     dropped_points: int  # which fewer than two images see after that
     sigma_scale: float  # on the stated sigmas of image observations
+    kept_points: NDArray[np.bool_] | None = None  # (P,) of the given block; None: all
 
 
 @dataclass(frozen=True)
@@ -102,9 +105,9 @@ def clean(
     marks = sum(len(point.marks) for point in datum)
     dropped = len(block.observations) - len(kept.observations)
     assert dropped <= found.dropped <= dropped + marks
-    kept, state, dropped_points = _with_seen_points(kept, state)
+    kept, state, seen = _with_seen_points(kept, state)
     rejected = tuple(entry for entry in found.rejected if entry.kind not in KINDS_OF_POINT)
-    return CleanBlock(kept, state, rejected, dropped, dropped_points, found.sigma_scale)
+    return CleanBlock(kept, state, rejected, dropped, int((~seen).sum()), found.sigma_scale, seen)
 
 
 def solve_with_control(
@@ -136,7 +139,7 @@ def with_control(block: Block, control: Sequence[ControlPoint]) -> Block:
     priors = PointPriors(
         point=first + np.arange(len(control)),
         position=positions,
-        information=np.array([np.linalg.inv(point.cov) for point in control], dtype=np.float64).reshape(-1, 3, 3),
+        information=np.array([_information(point) for point in control], dtype=np.float64).reshape(-1, 3, 3),
         kind=np.zeros(len(control), np.int64),
         point_ids=tuple(point.point_id for point in control),
     )
@@ -146,6 +149,10 @@ def with_control(block: Block, control: Sequence[ControlPoint]) -> Block:
         observations=Observations.joined([block.observations, marks.with_points(first + marks.point)]),
         point_priors=priors,
     )
+
+
+def _information(point: ControlPoint) -> Array:
+    return cast(Array, np.linalg.inv(point.cov)) if point.information is None else point.information
 
 
 def without_offset(block: Block) -> Block:
@@ -199,10 +206,9 @@ def _without_last_points(block: Block, state: State, count: int) -> tuple[Block,
     return kept, replace(state, points=state.points[:left])
 
 
-def _with_seen_points(block: Block, state: State) -> tuple[Block, State, int]:
-    """The block without points that fewer than two images are left for, given ones excepted."""
+def _with_seen_points(block: Block, state: State) -> tuple[Block, State, NDArray[np.bool_]]:
+    """The block without points that fewer than two images are left for, ends of distances excepted; which (P,) stay."""
     seen = np.bincount(block.observations.point, minlength=len(block.points)) >= 2
-    seen[block.point_priors.point] = True
     seen[block.distances.a] = seen[block.distances.b] = True
     obs = block.observations.take(seen[block.observations.point])
     number, points = np.cumsum(seen) - 1, state.points[seen]
@@ -210,7 +216,6 @@ def _with_seen_points(block: Block, state: State) -> tuple[Block, State, int]:
         block,
         observations=obs.with_points(number[obs.point]),
         points=points,
-        point_priors=replace(block.point_priors, point=number[block.point_priors.point]),
         distances=replace(block.distances, a=number[block.distances.a], b=number[block.distances.b]),
     )
-    return kept, replace(state, points=points), int((~seen).sum())
+    return kept, replace(state, points=points), seen
