@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -33,7 +33,7 @@ from georef.stages.base import Meter
 from georef.stages.block_comparison import comparisons
 from georef.stages.block_files import write_block_cameras, write_block_poses
 from georef.stages.block_hold_out import hold_out_numbers
-from georef.stages.block_numbers import rejected_numbers, variant_numbers
+from georef.stages.block_numbers import named, partial_check_numbers, rejected_numbers, variant_numbers
 from georef.stages.block_survey import BlockSurvey, load_block
 from georef.stages.block_words import text_of
 from georef.types.constraints import CheckPoint, ControlPoint
@@ -72,15 +72,16 @@ def run(project: Project, name: str, say: Say = lambda _: None) -> BlockRun:
         "block": name,
         "crs": survey.world.describe(),
         "data": _data(survey, cleaned),
-        "rejected": [rejected_numbers(entry) for entry in cleaned.rejected],
-        "variants": {title: variant_numbers(found) for title, found in solutions.items()},
+        "rejected": [rejected_numbers(named(entry, survey.tie_ids)) for entry in cleaned.rejected],
+        "variants": {title: _variant(survey, cleaned, found) for title, found in solutions.items()},
     }
     if survey.surveyed and survey.has_gnss and len(survey.block.drift_information) <= 1:
         say("offset between GNSS and surveyed points")
-        report["offset"] = _offset(survey, cleaned, config)
+        report["offset"] = _offset(survey, cleaned, config, solutions)
     if section.hold_out is not None and section.hold_out.control < len(survey.whole):
         say("splits into control and check points")
-        report["hold_out"] = hold_out_numbers(survey, cleaned, config, section.hold_out)
+        free = solutions["no control" if survey.declared_control else "as declared"] if survey.has_gnss else None
+        report["hold_out"] = hold_out_numbers(survey, cleaned, config, section.hold_out, free)
     if section.compare is not None:
         report["comparisons"] = comparisons(project, section.compare, final)
     report["timing"] = meter.read()
@@ -98,6 +99,14 @@ def _other_controls(survey: BlockSurvey) -> dict[str, tuple[str, ...]]:
     out: dict[str, tuple[str, ...]] = {"no control": ()} if every and survey.has_gnss else {}
     out |= {"all control": every} if every else {}
     return {title: control for title, control in out.items() if set(control) != set(survey.declared_control)}
+
+
+def _variant(survey: BlockSurvey, cleaned: CleanBlock, found: Solved) -> dict[str, Any]:
+    """A solution in numbers, with points that are known in part, and distances by the names of their ends."""
+    kept = np.ones(len(survey.tie_ids), bool) if cleaned.kept_points is None else cleaned.kept_points
+    ties = tuple(name for name, there in zip(survey.tie_ids, kept, strict=True) if there)
+    partial = partial_check_numbers(found, survey.partly_known(found.given_control))
+    return variant_numbers(found, ties) | {"partial_check_points": partial}
 
 
 def _data(survey: BlockSurvey, cleaned: CleanBlock) -> dict[str, Any]:
@@ -119,10 +128,15 @@ def _data(survey: BlockSurvey, cleaned: CleanBlock) -> dict[str, Any]:
     }
 
 
-def _offset(survey: BlockSurvey, cleaned: CleanBlock, config: AdjustConfig) -> dict[str, Any]:
-    """The offset of a block that GNSS alone holds from all surveyed points, none of which takes part."""
+def _offset(
+    survey: BlockSurvey, cleaned: CleanBlock, config: AdjustConfig, solutions: Mapping[str, Solved]
+) -> dict[str, Any]:
+    """The offset of a block that GNSS alone holds from all surveyed points, none of which takes part; without those
+    that contradict the others where they are control."""
+    wrong = {entry.name for found in solutions.values() for entry in found.rejected if entry.kind == "control"}
+    points = [point for point in survey.check(()) if point.point_id not in wrong]
     start = replace(cleaned.state, drift_m=np.zeros((0, 3)))
-    found = solved(without_offset(cleaned.block), start, survey.check(()), config)
+    found = solved(without_offset(cleaned.block), start, points, config)
     offset = common_offset(found.check)
     if offset is None:
         return {}
@@ -134,6 +148,7 @@ def _offset(survey: BlockSurvey, cleaned: CleanBlock, config: AdjustConfig) -> d
         "left_over": offset.left_over,
         "mean_difference_m": np.mean([e.difference_m for e in found.check.errors.determined], axis=0).tolist(),
         "points": len(found.check.errors.determined),
+        "left_out": sorted(wrong),
         "shared_unknowns": [asdict(unknown) for unknown in shared_unknowns(found)],
         "height_correlations": [asdict(c) for c in height],
         "correlations": [asdict(c) for c in strong_correlations(found)],

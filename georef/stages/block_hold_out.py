@@ -8,7 +8,7 @@ import numpy as np
 
 from georef.config import AdjustConfig
 from georef.estimation.adjustment.block_check import with_points_as_control
-from georef.estimation.adjustment.block_solutions import CleanBlock, solved, start_with, with_control
+from georef.estimation.adjustment.block_solutions import CleanBlock, Solved, solved, start_with, with_control
 from georef.evaluation.check_points import CheckPointErrors
 from georef.evaluation.splits import spread_splits
 from georef.evaluation.statistics import summarize_nees
@@ -19,9 +19,9 @@ from georef.stages.block_survey import BlockSurvey
 
 
 def hold_out_numbers(
-    survey: BlockSurvey, cleaned: CleanBlock, config: AdjustConfig, hold_out: HoldOut
+    survey: BlockSurvey, cleaned: CleanBlock, config: AdjustConfig, hold_out: HoldOut, free: Solved | None
 ) -> dict[str, Any]:
-    """The splits and their medians.
+    """The splits and their medians. free: the solution without control, where GNSS holds the datum.
 
     Where GNSS holds the datum, one solution without control tells how all surveyed points and the block hang together,
     and so what each choice of control does; the first split is adjusted as well, and the report says how far the two
@@ -29,7 +29,6 @@ def hold_out_numbers(
     """
     positions = {point.point_id: point.point_in_world[:2] for point in survey.surveyed}
     names = [point.point_id for point in survey.whole if len(point.marks) >= 2]
-    free = _adjusted(survey, cleaned, config, []) if survey.has_gnss else None
     if free is not None:
         names = [error.point_id for error in free.check.errors.determined]
     chosen = spread_splits(np.array([positions[name] for name in names]), hold_out.control, hold_out.count)
@@ -50,7 +49,7 @@ def hold_out_numbers(
     }
 
 
-def _adjusted(survey: BlockSurvey, cleaned: CleanBlock, config: AdjustConfig, names: list[str]):
+def _adjusted(survey: BlockSurvey, cleaned: CleanBlock, config: AdjustConfig, names: list[str]) -> Solved:
     control = survey.control(names)
     block, start = with_control(cleaned.block, control), start_with(cleaned.state, control)
     return solved(block, start, survey.check(names), config)

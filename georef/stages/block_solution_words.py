@@ -20,6 +20,7 @@ def variant_lines(title: str, variant: dict[str, Any]) -> list[str]:
     lines += [f"  rejected: {rejected_words(entry)}" for entry in variant["rejected"]]
     lines += [f"  rejected: {_mark_words(mark)}" for mark in variant["rejected_marks"]]
     lines += [f"  {line}" for line in (*_control_lines(variant), *_gnss_lines(variant))]
+    lines += [f"  {line}" for line in (*_distance_lines(variant), *_partial_lines(variant))]
     for kind, summary in variant["check"].items():
         rmse = [summary[f"rmse_{axis}_m"] for axis in "enh"]
         lines.append(f"  {summary['count']} {kind} check points, RMSE {cm(rmse)}, mean {cm(summary['mean_m'])}")
@@ -84,6 +85,25 @@ def _gnss_lines(variant: dict[str, Any]) -> Iterator[str]:
     worst = f"largest w {gnss['largest_w']:.1f} at {gnss['largest_w_of']}"
     yield f"residuals of GNSS, RMS      {cm(gnss['residual_rms_m'])}; {worst}"
     yield f"detectable in GNSS E/N/H    smallest {low}, median {middle}, largest {high}"
+
+
+def _distance_lines(variant: dict[str, Any]) -> Iterator[str]:
+    for row in variant["distances"]:
+        checked = (
+            "nothing checks it" if row["w"] is None else f"w {row['w']:+.1f}, detectable {cm([row['detectable_m']])}"
+        )
+        yield (
+            f"distance {row['a']} to {row['b']}: {row['distance_m']:.4f} m, residual {cm([row['residual_m']])}, "
+            f"redundancy {row['redundancy']:.2f}, {checked}"
+        )
+
+
+def _partial_lines(variant: dict[str, Any]) -> Iterator[str]:
+    for row in variant["partial_check_points"]:
+        yield (
+            f"check point {row['point_id']}, known in part: E/N/H {cm(row['difference_m'])}, "
+            f"predicted 1-sigma {cm(row['predicted_sigma_m'])}"
+        )
 
 
 def _numbers(values: Sequence[float | None], factor: float, form: str) -> str:

@@ -24,7 +24,6 @@ SENSOR_MM = (15.0, 10.0)
 LEVER_M = np.array([0.05, -0.10, -0.30])
 GNSS_M, SURVEYED_M = np.array([0.02, 0.02, 0.03]), np.array([0.01, 0.01, 0.015])
 TIE_PX, MARK_PX = 0.6, 0.3
-_STRIPS, _ALONG = 4, 10
 _TILT = np.radians(45.0)
 _NOMINAL = {  # turns of the camera from looking down: about its x axis, then its y axis
     "N": (0.0, 0.0),
@@ -83,12 +82,12 @@ def nominal(name: str) -> Rigid3:
     return Rigid3(exp_so3(np.array([about_x, about_y, 0.0])), np.array([*place, 0.02]))
 
 
-def oblique(seed: int = 0) -> Oblique:
+def oblique(seed: int = 0, strips: int = 4, along: int = 10) -> Oblique:
     """The truth of a seed: mountings 0.3 deg and 1 cm off the maker's, lenses of their own."""
     rng = np.random.default_rng(seed)
-    count = _STRIPS * _ALONG
-    strip, along = np.divmod(np.arange(count), _ALONG)
-    places = np.stack([25.0 * along, 35.0 * strip, np.full(count, 80.0)], axis=1) + rng.normal(size=(count, 3))
+    count = strips * along
+    strip, place = np.divmod(np.arange(count), along)
+    places = np.stack([25.0 * place, 35.0 * strip, np.full(count, 80.0)], axis=1) + rng.normal(size=(count, 3))
     turn = np.pi * (strip % 2) + np.radians(10.0)
     right = np.stack([np.sin(turn), -np.cos(turn), np.zeros(count)], axis=1)
     down = np.tile([0.0, 0.0, -1.0], (count, 1))
@@ -96,9 +95,10 @@ def oblique(seed: int = 0) -> Oblique:
     rotation = level @ exp_many(np.radians(1.5) * rng.normal(size=(count, 3)))
     sigma = np.array([*[np.radians(0.3)] * 3, *[0.01] * 3])
     mountings = {name: nominal(name).retract(sigma * rng.normal(size=6) * (name != "N")) for name in NAMES}
+    size = np.array([25.0 * (along - 1), 35.0 * (strips - 1)])
     mountings["N"] = Rigid3.identity()
     cameras = {name: _camera(name, rng) for name in NAMES}
-    return Oblique(Poses(rotation, places), mountings, cameras, _ground(rng, 700), _ground(rng, 9, 0.0))
+    return Oblique(Poses(rotation, places), mountings, cameras, _ground(rng, 700, size), _ground(rng, 9, size, 0.0))
 
 
 def _camera(name: str, rng: np.random.Generator) -> Camera:
@@ -107,8 +107,8 @@ def _camera(name: str, rng: np.random.Generator) -> Camera:
     return Camera(name, 3000, 2000, focal, focal, cx, cy, (-0.05 + 0.005 * rng.normal(), 0.01, 3e-4, -2e-4, 0.0))
 
 
-def _ground(rng: np.random.Generator, count: int, beyond: float = 70.0) -> Array:
-    plan = rng.uniform([-beyond, -beyond], [225.0 + beyond, 105.0 + beyond], (count, 2))
+def _ground(rng: np.random.Generator, count: int, size: Array, beyond: float = 70.0) -> Array:
+    plan = rng.uniform(-beyond, size + beyond, (count, 2))
     return np.column_stack([plan, 5.0 * np.sin(plan[:, 0] / 19.0) + 4.0 * np.cos(plan[:, 1] / 15.0)])
 
 
@@ -187,7 +187,7 @@ def _write_measurements(made: Oblique, path: Path, form: str, rng: np.random.Gen
 def _write_gnss(made: Oblique, path: Path, rng: np.random.Generator, by_image: bool, wrong_m: float) -> None:
     stations = made.world_from_rig
     antenna = stations.translation + stations.rotation @ LEVER_M + GNSS_M * rng.normal(size=(len(stations), 3))
-    antenna[17, 0] += wrong_m
+    antenna[min(17, len(antenna) - 1), 0] += wrong_m
     lines = ["image,station,time,x,y,z,sigma_x,sigma_y,sigma_z"]
     for s, place in enumerate(antenna):
         for k, name in enumerate(NAMES if by_image else ("N",)):

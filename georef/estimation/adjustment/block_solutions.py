@@ -65,6 +65,7 @@ class Solved:
     check: BlockCheck
     rejected: tuple[RejectedConstraint, ...] = ()  # in this solution, beside those of the clean block
     rejected_marks: tuple[RejectedMark, ...] = ()
+    given_control: tuple[str, ...] = ()  # ids, those that were rejected included
 
     @property
     def cofactors(self) -> Cofactors:
@@ -116,12 +117,13 @@ def solve_with_control(
     """Adjusts with some points as control, which pass gates; the others are intersected and take no part."""
     start = start_with(given.state, control)
     block = with_control(given.block, control)
+    names = tuple(point.point_id for point in control)
     if not control:
         return solved(block, start, check, config)
     found = adjust_block(block, options_of(config), start)
     checked = check_block(found.block, found.solution.state, found.quality.cofactors.apply, check)
     marks = rejected_marks(block, found, control)
-    return Solved(found.block, found.solution, found.quality, checked, found.rejected, marks)
+    return Solved(found.block, found.solution, found.quality, checked, found.rejected, marks, names)
 
 
 def solved(block: Block, start: State, check: Sequence[CheckPoint], config: AdjustConfig) -> Solved:
