@@ -118,8 +118,8 @@ def distance_numbers(found: Solved, tie_ids: Sequence[str]) -> list[dict[str, An
                 "distance_m": float(given.distance_m[row]),
                 "residual_m": length - float(given.distance_m[row]),
                 "redundancy": redundancy,
-                "w": float(test.residual[k, 0]) / np.sqrt(redundancy) if checked else None,
-                "detectable_m": DELTA0 * sigma / np.sqrt(redundancy) if checked else None,
+                "w": float(test.residual[k, 0] / np.sqrt(redundancy)) if checked else None,
+                "detectable_m": float(DELTA0 * sigma / np.sqrt(redundancy)) if checked else None,
             }
         )
     return out

@@ -138,5 +138,6 @@ def _pose_nees(made: Oblique, folder: Path) -> float:
     for record in records:
         found = Rigid3(np.asarray(record.axes_from_cam), np.asarray(record.position_in_crs))
         error = made.world_from_cam(record.image_id).local(found)
+        assert record.cov is not None
         ratios.append(error @ np.linalg.solve(record.cov, error) / 6.0)
     return float(np.mean(ratios))
