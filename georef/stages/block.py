@@ -29,16 +29,18 @@ from georef.estimation.adjustment.block_solutions import (
 )
 from georef.io.files import write_text_atomically
 from georef.project import Project
+from georef.report.block_page import render_block
 from georef.stages.base import Meter
 from georef.stages.block_comparison import comparisons
 from georef.stages.block_files import write_block_cameras, write_block_poses
 from georef.stages.block_hold_out import hold_out_numbers
 from georef.stages.block_numbers import named, partial_check_numbers, rejected_numbers, variant_numbers
+from georef.stages.block_pictures import picture_numbers
 from georef.stages.block_survey import BlockSurvey, load_block
 from georef.stages.block_words import text_of
 from georef.types.constraints import CheckPoint, ControlPoint
 
-REPORT, TEXT, POSES, CAMERAS = "report.json", "report.txt", "poses.csv", "cameras.csv"
+REPORT, TEXT, PAGE, POSES, CAMERAS = "report.json", "report.txt", "report.html", "poses.csv", "cameras.csv"
 Say = Callable[[str], None]
 
 
@@ -84,6 +86,7 @@ def run(project: Project, name: str, say: Say = lambda _: None) -> BlockRun:
         report["hold_out"] = hold_out_numbers(survey, cleaned, config, section.hold_out, free)
     if section.compare is not None:
         report["comparisons"] = comparisons(project, section.compare, final)
+    report["figures"] = picture_numbers(survey, final, solutions.get("all control"))
     report["timing"] = meter.read()
     return _published(project, name, survey, final, report)
 
@@ -161,5 +164,6 @@ def _published(project: Project, name: str, survey: BlockSurvey, final: Solved, 
     write_block_poses(survey, final, folder / POSES)
     write_block_cameras(final, folder / CAMERAS)
     write_text_atomically("\n".join(lines) + "\n", folder / TEXT)
+    write_text_atomically(render_block(report), folder / PAGE)
     write_text_atomically(json.dumps(report, indent=1, allow_nan=False), folder / REPORT)
-    return BlockRun(report, tuple(lines), tuple(folder / part for part in (REPORT, TEXT, POSES, CAMERAS)))
+    return BlockRun(report, tuple(lines), tuple(folder / part for part in (REPORT, TEXT, PAGE, POSES, CAMERAS)))
