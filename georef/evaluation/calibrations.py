@@ -23,15 +23,30 @@ class CalibrationDifference:
     largest_shape_px: float
 
 
+def difference_map(camera: Camera, other: Camera, grid: int = _GRID) -> tuple[Array, Array]:
+    """Pixels (n, 2) of a grid over the image that `other` sees, and what `camera` differs by there (n, 2), px.
+
+    The best turn of the camera and change of scale are taken off.
+    """
+    pixels, rays, difference = _differences(camera, other, grid)
+    return pixels, _without_turn_and_scale(difference, rays)
+
+
 def compare_calibrations(camera: Camera, other: Camera) -> CalibrationDifference:
     """Pixels of `camera` less those of `other` for the directions that `other` gives to a grid of pixels."""
-    across, down = np.meshgrid(np.linspace(0, other.width, _GRID), np.linspace(0, other.height, _GRID))
+    _, rays, difference = _differences(camera, other, _GRID)
+    rest = _without_turn_and_scale(difference, rays)
+    return CalibrationDifference(*_sizes(difference), *_sizes(rest))
+
+
+def _differences(camera: Camera, other: Camera, grid: int) -> tuple[Array, Array, Array]:
+    """Pixels (n, 2) of a grid, their rays (n, 3) by `other`, and the pixels of `camera` there less them (n, 2)."""
+    across, down = np.meshgrid(np.linspace(0, other.width, grid), np.linspace(0, other.height, grid))
     pixels = np.stack([across.ravel(), down.ravel()], axis=1)
     rays = rays_from_pixels(other, pixels)
     difference = project(camera, rays) - pixels
     seen = np.isfinite(difference).all(axis=1)
-    rest = _without_turn_and_scale(difference[seen], rays[seen])
-    return CalibrationDifference(*_sizes(difference[seen]), *_sizes(rest))
+    return pixels[seen], rays[seen], difference[seen]
 
 
 def _without_turn_and_scale(difference: Array, rays: Array) -> Array:

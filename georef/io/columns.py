@@ -68,9 +68,12 @@ def require_columns(table: Table, crs_kind: CrsKind, names: Sequence[str]) -> No
     table.require(names)
 
 
-def read_positions(table: Table, crs_kind: CrsKind) -> Array:
-    """The position columns (N, 3), unchanged: metres, or degrees and metres. Raises InputError for impossible ones."""
-    positions = table.stack(POSITION_COLUMNS[crs_kind])
+def read_positions(table: Table, crs_kind: CrsKind, *, allow_empty: bool = False) -> Array:
+    """The position columns (N, 3), unchanged: metres, or degrees and metres; NaN for empty cells where allowed.
+
+    Raises InputError for impossible ones.
+    """
+    positions = table.stack(POSITION_COLUMNS[crs_kind], allow_empty=allow_empty)
     if crs_kind == "geographic":
         for axis, limit in ((1, 90.0), (0, 360.0)):
             for i in np.flatnonzero(np.abs(positions[:, axis]) > limit)[:1]:
@@ -91,20 +94,22 @@ def read_sigmas(
     expected: str,
     remedy: Callable[[int], str] = lambda _: "Correct the value.",
     allow_empty: bool = False,
+    allow_partly_empty: bool = False,
 ) -> Array:
-    """Columns of standard deviations (N, len(names)), all positive; rows of NaN for items without, where allowed.
+    """Columns of standard deviations (N, len(names)), all positive; rows of NaN for items without, where allowed, and
+    single ones where that is.
 
     subject and remedy give, for the index of an item, its name and what to do. Raises InputError for zero, negative
     and partly empty ones.
     """
-    sigmas = table.stack(names, allow_empty=allow_empty)
+    sigmas = table.stack(names, allow_empty=allow_empty or allow_partly_empty)
     for i, k in np.argwhere(sigmas <= 0)[:1]:
         value = float(sigmas[i, k])
         fault = "which would fix it exactly" if value == 0 else "and a standard deviation is never negative"
         raise table.error(
             int(i), f"{subject(int(i))} has {names[k]} = {value}, {fault}.", expected=expected, remedy=remedy(int(i))
         )
-    empty = np.isnan(sigmas)
+    empty = np.isnan(sigmas) & (not allow_partly_empty)
     for i in np.flatnonzero(empty.any(axis=1) & ~empty.all(axis=1))[:1]:
         raise table.error(
             int(i),

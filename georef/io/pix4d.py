@@ -8,6 +8,7 @@ model `brown` (R1, R2, R3 = k1, k2, k3; T1, T2 = p1, p2). Angles are omega-phi-k
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -58,6 +59,7 @@ GIVEN_COLUMNS = POSE_COLUMNS | {
 _HEADER_LINES = ("fileName imageWidth imageHeight", "radial distortion [3x1]", "tangential distortion [2x1]")
 _LINES, _IMAGE_LINES = 8, 10  # of the header, and of each image: name, K (3), radial, tangential, t, R (3)
 _NUMBERS_OF_LINE = (3, 3, 3, 3, 2, 3, 3, 3, 3)
+_CAMERA_TITLE = re.compile(r"Pix4D camera calibration file", re.IGNORECASE)
 _CAMERA_KEYS = ("F", "Px", "Py", "K1", "K2", "K3", "T1", "T2")
 
 
@@ -116,15 +118,36 @@ def read_pix4d_given(path: Path | str, *, crs_kind: CrsKind = "projected") -> Gn
 
 
 def read_pix4d_camera(path: Path | str, size: tuple[int, int]) -> Camera:
-    """The camera of `*_pix4d_calibrated_internal_camera_parameters.cam`, whose millimetres a size (px) turns to pixels.
+    """The only camera of `*_pix4d_calibrated_internal_camera_parameters.cam`, whose millimetres a size (px) turns to
+    pixels. Raises InputError, also where the file holds several cameras."""
+    cameras = read_pix4d_cameras(path, [size])
+    return cameras[0]
 
-    Raises InputError.
+
+def read_pix4d_cameras(path: Path | str, sizes: Sequence[tuple[int, int]]) -> tuple[Camera, ...]:
+    """The cameras of `*_pix4d_calibrated_internal_camera_parameters.cam`, in its order; sizes (px) of their images.
+
+    Each begins with a line `Pix4D camera calibration file`. Raises InputError, also where their number is another.
     """
     path = Path(path)
-    text = read_text(path)
-    width = re.search(r"sensor width of\s+([\d.]+)\s*x", text)
+    lines = read_text(path).split("\n")
+    starts = [i for i, line in enumerate(lines) if _CAMERA_TITLE.match(line.strip())] or [0]
+    if len(starts) != len(sizes):
+        raise InputError(
+            f"The camera file holds {len(starts)} cameras where {len(sizes)} are expected.",
+            expected="one section `Pix4D camera calibration file` for each camera that is compared.",
+            remedy="Name the cameras in the order of the file, or a file of one camera for each.",
+            path=path,
+        )
+    ends = [*starts[1:], len(lines)]
+    return tuple(_camera(lines, *span, path) for span in zip(starts, ends, sizes, strict=True))
+
+
+def _camera(lines: list[str], start: int, end: int, size: tuple[int, int], path: Path) -> Camera:
+    """The camera of the lines from start to end."""
+    width = re.search(r"sensor width of\s+([\d.]+)\s*x", "\n".join(lines[start:end]))
     values: dict[str, float] = {}
-    for row, line in enumerate(text.split("\n"), start=1):
+    for row, line in enumerate(lines[start:end], start=start + 1):
         words = line.split()
         if len(words) == 2 and words[0] in _CAMERA_KEYS:
             values[words[0]] = _number(words[1], path, row)

@@ -5,9 +5,11 @@ from __future__ import annotations
 import logging
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from georef.crs import CrsDefinition
 from georef.errors import InputError
@@ -43,15 +45,24 @@ def read_tables(project: Project, section: BlockSection, kind: CrsKind, definiti
     if section.gnss is not None:
         table = section.gnss.table
         path = project.data(section.gnss.file)
-        gnss = read_gnss(path, crs_kind=kind, columns=table.columns or None, table_format=table_format(table))
+        gnss = read_gnss(
+            path,
+            crs_kind=kind,
+            columns=table.columns or None,
+            table_format=table_format(table),
+            flight=None if section.gnss.drift is None else section.gnss.drift.flight,
+        )
         check_frame(gnss, definition)
-        if gnss.unstated:
+        if gnss.unstated and section.gnss.sigma_m is None:
             raise InputError(
                 "The table of positions states no sigmas.",
                 expected="a standard deviation of each coordinate: positions are observations of the adjustment.",
-                remedy="Add the columns, or map them in project.toml: table.columns = { sigma_e = ... }.",
+                remedy="Add the columns, map them in project.toml: table.columns = { sigma_e = ... }, or state one for "
+                "all: gnss.sigma_m = [0.02, 0.02, 0.04].",
                 path=gnss.path,
             )
+        if gnss.unstated:
+            gnss = replace(gnss, sigmas_m=np.tile(np.array(section.gnss.sigma_m), (len(gnss), 1)))
     if section.attitude != "vertical":
         given = section.attitude
         attitude = read_exterior_orientation(
@@ -66,20 +77,52 @@ def read_tables(project: Project, section: BlockSection, kind: CrsKind, definiti
     return BlockTables(gnss, attitude)
 
 
-def rows_of(table: GnssTable | ExteriorOrientationTable, image_ids: Sequence[str], measured: BingoTable) -> IntArray:
-    """The row of each image in a table that may name images with the ending of their file. Raises InputError."""
-    index = {_ENDING.sub("", name): i for i, name in enumerate(table.image_ids)}
-    index |= {name: i for i, name in enumerate(table.image_ids)}
-    missing = [k for k, name in enumerate(image_ids) if name not in index]
-    if missing:
+def rows_of(
+    table: GnssTable | ExteriorOrientationTable, image_ids: Sequence[str], stations: Sequence[str] | None = None
+) -> IntArray:
+    """The row of each image (M,) in a table that may name images with the ending of their file, or their exposures
+    (M names); -1 where it has none."""
+    index = {name: i for i, name in enumerate(table.image_ids)}
+    bare = {bare_name(name): i for name, i in index.items()}
+    found = [index.get(name, bare.get(bare_name(name), -1)) for name in image_ids]
+    if stations is not None:
+        found = [row if row >= 0 else index.get(name, -1) for row, name in zip(found, stations, strict=True)]
+    taken = len({row for row in found if row >= 0})
+    if taken < len(table):
+        logger.warning("%s: %d rows are of no image that has measurements", table.path, len(table) - taken)
+    return np.array(found, dtype=np.int64)
+
+
+def require_rows(found: NDArray[np.bool_], path: Path, image_ids: Sequence[str], measured: BingoTable) -> None:
+    """Raises InputError where an image has nothing to start from: found (M,)."""
+    missing = np.flatnonzero(~found)
+    if len(missing):
         raise InputError(
-            f"{len(missing)} images have measurements and no row in {table.path.name}, the first is "
+            f"{len(missing)} images have measurements and no row in {path.name}, the first is "
             f"'{image_ids[missing[0]]}'.",
             expected="the names of images of the measurements, with or without the ending of their files.",
-            remedy=f"Add their rows to {table.path}, or delete their measurements.",
+            remedy=f"Add their rows to {path}, or delete their measurements.",
             path=measured.path,
             row=int(measured.image_rows[missing[0]]),
         )
-    if len(table) > len(image_ids):
-        logger.warning("%s: %d images have no measurements", table.path, len(table) - len(image_ids))
-    return np.array([index[name] for name in image_ids], dtype=np.int64)
+
+
+def bare_name(image_id: str) -> str:
+    """The name without the ending of its file."""
+    return _ENDING.sub("", image_id)
+
+
+def by_pattern(pattern: str, image_ids: Sequence[str], what: str) -> tuple[str, ...]:
+    """What the groups of a pattern say of each name (M), joined. Raises InputError where it does not fit."""
+    expression = re.compile(pattern)
+    out: list[str] = []
+    for name in image_ids:
+        found = expression.search(name)
+        if found is None or not any(found.groups()):
+            raise InputError(
+                f"The pattern {pattern!r} does not fit the image '{name}': nothing says its {what}.",
+                expected=f"a regular expression whose groups are the {what} in every name.",
+                remedy="Correct the pattern in project.toml.",
+            )
+        out.append("_".join(group for group in found.groups() if group))
+    return tuple(out)

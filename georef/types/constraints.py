@@ -31,15 +31,25 @@ class Mark:
 
 @dataclass(frozen=True, eq=False)
 class ControlPoint:
-    """A point whose coordinates take part in the adjustment."""
+    """A point whose coordinates take part in the adjustment.
+
+    information: (3, 3) in world, of lower rank where only its height, or only its horizontal coordinates are given; the
+    covariance says next to nothing of the others then. None: the inverse of the covariance.
+    """
 
     point_id: str
     point_in_world: Array  # (3,)
     cov: Array  # (3, 3)
     marks: tuple[Mark, ...]
+    information: Array | None = None
 
     def __post_init__(self) -> None:
         require_covariance(self.cov, 3)
+
+    @property
+    def whole(self) -> bool:
+        """Whether all three coordinates are given."""
+        return self.information is None
 
 
 @dataclass(frozen=True, eq=False)

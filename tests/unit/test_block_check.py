@@ -52,7 +52,7 @@ def test_points_follow_the_unknowns_as_their_derivatives_say(survey: BlockSurvey
 
 def test_the_image_sigma_and_the_camera_are_found(cleaned: CleanBlock, free: Solved) -> None:
     assert 0.6 < cleaned.sigma_scale < 0.8  # 0.7 px were made, 1 px stated
-    assert cleaned.rejected < 0.01 * (cleaned.rejected + len(cleaned.block.observations))
+    assert cleaned.dropped < 0.01 * (cleaned.dropped + len(cleaned.block.observations))
     found = {unknown.name: unknown for unknown in shared_unknowns(free)}
     for name, truth in (("c focal", 4100.0), ("c cx", 2010.0), ("c cy", 1490.0), ("c k1", -0.05), ("c k2", 0.02)):
         assert abs(found[name].value - truth) < 4.0 * found[name].sigma
@@ -81,7 +81,7 @@ def test_control_without_adjusting_again_is_what_adjusting_gives(survey: BlockSu
             drift_information=np.diag([100.0, 100.0, 25.0])[None],
         ),
         replace(cleaned.state, drift_m=np.zeros((1, 3))),
-        *(cleaned.rejected, cleaned.dropped_points, cleaned.sigma_scale),
+        *(cleaned.rejected, cleaned.dropped, cleaned.dropped_points, cleaned.sigma_scale),
     )
     free = solve_with_control(offset, (), survey.check(()), _CONFIG)
     control = ("P0", "P3", "P5", "P6")

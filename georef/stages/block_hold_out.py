@@ -1,0 +1,69 @@
+"""Splits of surveyed points into control and check points, and what the check points say of each."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from georef.config import AdjustConfig
+from georef.estimation.adjustment.block_check import with_points_as_control
+from georef.estimation.adjustment.block_solutions import CleanBlock, Solved, solved, start_with, with_control
+from georef.evaluation.check_points import CheckPointErrors
+from georef.evaluation.splits import spread_splits
+from georef.evaluation.statistics import summarize_nees
+from georef.geometry.rigid import Array
+from georef.sections import HoldOut
+from georef.stages.block_numbers import rms
+from georef.stages.block_survey import BlockSurvey
+
+
+def hold_out_numbers(
+    survey: BlockSurvey, cleaned: CleanBlock, config: AdjustConfig, hold_out: HoldOut, free: Solved | None
+) -> dict[str, Any]:
+    """The splits and their medians. free: the solution without control, where GNSS holds the datum.
+
+    Where GNSS holds the datum, one solution without control tells how all surveyed points and the block hang together,
+    and so what each choice of control does; the first split is adjusted as well, and the report says how far the two
+    differ. Without GNSS each split is adjusted. No split passes gates: none of its check points may be told by results.
+    """
+    positions = {point.point_id: point.point_in_world[:2] for point in survey.surveyed}
+    names = [point.point_id for point in survey.whole if len(point.marks) >= 2]
+    if free is not None:
+        names = [error.point_id for error in free.check.errors.determined]
+    chosen = spread_splits(np.array([positions[name] for name in names]), hold_out.control, hold_out.count)
+    controls = [[names[i] for i in split] for split in chosen]
+    if free is not None:
+        errors = [with_points_as_control(free.check, split) for split in chosen]
+    else:
+        errors = [_adjusted(survey, cleaned, config, control).check.errors for control in controls]
+    splits = [_split_result(*pair) for pair in zip(errors, controls, strict=True)]
+    again = _adjusted(survey, cleaned, config, controls[0]).check.errors if free is not None else errors[0]
+    values = [value for split in splits for value in split["nees"]]
+    return {
+        "splits": splits,
+        "median_rmse_m": np.median([split["rmse_m"] for split in splits], axis=0).tolist(),
+        "largest_rmse_m": np.max([split["rmse_m"] for split in splits], axis=0).tolist(),
+        "nees": summarize_nees(values, 3, effective_dof=3.0 * len(names)).to_dict(),
+        "first_split_adjusted_differs_m": float(np.abs(_differences(again) - splits[0]["differences_m"]).max()),
+    }
+
+
+def _adjusted(survey: BlockSurvey, cleaned: CleanBlock, config: AdjustConfig, names: list[str]) -> Solved:
+    control = survey.control(names)
+    block, start = with_control(cleaned.block, control), start_with(cleaned.state, control)
+    return solved(block, start, survey.check(names), config)
+
+
+def _differences(errors: CheckPointErrors) -> Array:
+    return np.array([error.difference_m for error in errors.determined])
+
+
+def _split_result(errors: CheckPointErrors, control: list[str]) -> dict[str, Any]:
+    return {
+        "control": control,
+        "check": [error.point_id for error in errors.determined],
+        "rmse_m": rms(_differences(errors)),
+        "differences_m": [error.difference_m.tolist() for error in errors.determined],
+        "nees": [error.nees for error in errors.determined],
+    }
