@@ -11,13 +11,15 @@ from scipy.linalg import block_diag
 
 from georef.evaluation.check_points import CheckPointError, CheckPointErrors, CheckPointReport
 from georef.geometry.rigid import Array
-from georef.report.plan import Placed, plan_section
+from georef.report.plan import Placed, placed_in_plan, plan_section
 from georef.types.constraints import CheckKind
 from georef.types.results import Localized, Outcome, Rejected
 
 SCHEMA = 1
 _NO_CHECK = {"count": 0, "kind": None, "rmse_e_m": None, "rmse_n_m": None, "rmse_h_m": None, "rmse_3d_m": None}
 
+_SHARED = ("shared_unknowns", "correlations", "correlations_in_all", "weak_focals")
+_RELIABILITY = ("redundancy", "rejected_constraints", *_SHARED)
 _ADJUSTMENT = ("iterations", "converged", "image_sigma_scale", "coherent_blocks", "undecidable")
 
 
@@ -76,6 +78,9 @@ def build_report(given: ReportInput) -> dict[str, Any]:
         "gates": given.adjustment.get("gates", {}),
         "variance_components": given.adjustment.get("variance_components", {}),
         "adjustment": {key: given.adjustment.get(key) for key in _ADJUSTMENT},
+        "reliability": {key: given.adjustment[key] for key in _RELIABILITY if key in given.adjustment}
+        | {"groups": _reliability_groups(given)},
+        "datum": given.adjustment.get("datum", {}),
         "plan": _plan(given),
         "timings": given.timings,
         "config": given.config,
@@ -136,6 +141,17 @@ def _plan(given: ReportInput) -> dict[str, Any]:
     check = {e.point_id: e.difference_m for report in given.check_after.values() for e in report.errors.determined}
     control = {c["point"]: np.array(c["residual_m"]) for c in given.adjustment.get("control", [])}
     return plan_section(given.placed, check, control)
+
+
+def _reliability_groups(given: ReportInput) -> dict[str, Any]:
+    """Summaries of the groups; the places of their members in the frame of the plan."""
+    out = {}
+    for name, group in given.adjustment.get("reliability", {}).items():
+        members = group["in_plan"]
+        places = placed_in_plan(given.placed, [member["place_m"] for member in members])
+        moved = [{**member, "position_m": place} for member, place in zip(members, places, strict=True)]
+        out[name] = {**group, "in_plan": [{k: v for k, v in m.items() if k != "place_m"} for m in moved]}
+    return out
 
 
 def _check_section(reports: Mapping[CheckKind, CheckPointReport], given: ReportInput) -> dict[str, Any]:
