@@ -116,6 +116,27 @@ class StationsConfig(Section):
     gate_probability: float = Field(default=0.999, gt=0.5, lt=1)
 
 
+DatumFinding = Literal[
+    "height offset",
+    "height scale",
+    "heights reversed",
+    "axes swapped",
+    "handedness",
+    "axes turned",
+    "feet",
+    "wrong zone",
+    "false origin",
+    "antenna offset",
+    "shift",
+    "turn",
+    "scale",
+    "several",
+    "unrelated",
+    "undecided",
+]
+"""Faults that separate map, GNSS and control, by the names of `georef.estimation.datum_types.Kind`."""
+
+
 class AdjustConfig(Section):
     constraints: Literal["auto-gcps", "pose-priors", "none"] = "auto-gcps"
     tie_points: bool = True
@@ -128,6 +149,7 @@ class AdjustConfig(Section):
     cauchy_scale: float = Field(default=2.0, gt=0)
     gate_probability: float = Field(default=0.999, gt=0.5, lt=1)
     max_iterations: int = Field(default=30, ge=1)
+    accept_datum: tuple[DatumFinding, ...] = ()
 
     @field_validator("constraints", mode="before")
     @classmethod

@@ -85,7 +85,7 @@ def _part(block: Block, state: State, test: TermTests, axes: Axes | None) -> Rel
     back = np.linalg.pinv(weight)
     redundant = back @ test.cofactor @ weight
     with np.errstate(divide="ignore", invalid="ignore"):
-        redundancy = np.where(weighted, power / _diagonal(information), np.nan)
+        redundancy = np.where(weighted, np.maximum(power, 0.0) / _diagonal(information), np.nan)
         found = weighted & (redundancy > _CHECKED)
         sigma = np.sqrt(power)
         w = np.einsum("kji,kj->ki", weight, test.residual) / sigma
