@@ -116,25 +116,10 @@ class StationsConfig(Section):
     gate_probability: float = Field(default=0.999, gt=0.5, lt=1)
 
 
-DatumFinding = Literal[
-    "height offset",
-    "height scale",
-    "heights reversed",
-    "axes swapped",
-    "handedness",
-    "axes turned",
-    "feet",
-    "wrong zone",
-    "false origin",
-    "antenna offset",
-    "shift",
-    "turn",
-    "scale",
-    "several",
-    "unrelated",
-    "undecided",
-]
-"""Faults that separate map, GNSS and control, by the names of `georef.estimation.datum_types.Kind`."""
+DATUM_FINDINGS = (
+    *("height offset", "height scale", "heights reversed", "axes swapped", "handedness", "axes turned", "feet"),
+    *("wrong zone", "false origin", "antenna offset", "shift", "turn", "scale", "several", "unrelated", "undecided"),
+)
 
 
 class AdjustConfig(Section):
@@ -149,7 +134,14 @@ class AdjustConfig(Section):
     cauchy_scale: float = Field(default=2.0, gt=0)
     gate_probability: float = Field(default=0.999, gt=0.5, lt=1)
     max_iterations: int = Field(default=30, ge=1)
-    accept_datum: tuple[DatumFinding, ...] = ()
+    accept_datum: list[str] = []
+
+    @field_validator("accept_datum")
+    @classmethod
+    def _findings(cls, value: list[str]) -> list[str]:
+        if set(value) - set(DATUM_FINDINGS):
+            raise ValueError(f"expected some of: {', '.join(DATUM_FINDINGS)}")
+        return value
 
     @field_validator("constraints", mode="before")
     @classmethod

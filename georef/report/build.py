@@ -197,9 +197,12 @@ def _control_section(given: ReportInput) -> dict[str, Any]:
     """Control apart from check: residuals of the points that took part, in CRS axes."""
     points = []
     for entry in given.adjustment.get("control", []):
-        turn = given.axes_from_world[entry["point"]]
-        points.append({**entry, "residual_m": (turn @ entry["residual_m"]).tolist()})
-    residuals = np.array([p["residual_m"] for p in points]).reshape(-1, 3)
+        turned = (given.axes_from_world[entry["point"]] @ entry["residual_m"]).tolist()
+        known = [
+            r if sigma is not None else None for r, sigma in zip(turned, entry.get("sigma_m", turned), strict=True)
+        ]
+        points.append({**entry, "residual_m": known})
+    residuals = np.array([p["residual_m"] for p in points], dtype=np.float64).reshape(-1, 3)
     section: dict[str, Any] = {
         "used": given.surveyed_control,
         "available": len(given.control_ids),
@@ -207,7 +210,8 @@ def _control_section(given: ReportInput) -> dict[str, Any]:
         "points": points,
     }
     if len(points):
-        square = np.square(residuals).mean(axis=0)
+        count = np.maximum(np.isfinite(residuals).sum(axis=0), 1)
+        square = np.nansum(np.square(residuals), axis=0) / count
         e, n, h = np.sqrt(square).tolist()
         section |= {"rmse_e_m": e, "rmse_n_m": n, "rmse_h_m": h, "rmse_3d_m": float(np.sqrt(square.sum()))}
     return section

@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 
-from georef.config import DatumFinding
 from georef.errors import InputError
 from georef.estimation.datum_pairs import CONTROL, GNSS, Origin, contradiction, control_pairs, gnss_pairs
 from georef.estimation.datum_sentinel import DatumReport, Finding, Paired, compare_datums
@@ -64,9 +63,7 @@ def check_datum(
     return {"comparisons": [_plain(source, report, config.accept_datum) for source, _, report in found]}
 
 
-def _refuse(
-    source: _Source, paired: Paired, report: DatumReport, accepted: Sequence[DatumFinding], beside: str
-) -> None:
+def _refuse(source: _Source, paired: Paired, report: DatumReport, accepted: Sequence[str], beside: str) -> None:
     """Raises for the first finding that is certain and not accepted; says the others. beside: what else is known."""
     for finding in report.findings:
         if finding.kind in accepted:
@@ -115,7 +112,7 @@ def _alike(a: Finding, b: Finding) -> bool:
     return bool((np.abs(a.value - b.value) <= 5.0 * np.hypot(a.sigma, b.sigma) + 1e-9).all())
 
 
-def _plain(source: _Source, report: DatumReport, accepted: Sequence[DatumFinding]) -> dict[str, Any]:
+def _plain(source: _Source, report: DatumReport, accepted: Sequence[str]) -> dict[str, Any]:
     return {
         "source": source.name,
         "pairs": report.pairs,

@@ -14,6 +14,7 @@ from scipy.linalg import block_diag
 from georef import __version__
 from georef.evaluation.check_points import CheckPointReport, evaluate_check_points
 from georef.evaluation.forward_intersection import PosedImages
+from georef.geometry.camera import Camera
 from georef.geometry.rigid import Array, Rigid3
 from georef.io.files import copy_atomically, write_text_atomically
 from georef.io.pose_records import PoseRecord, PosesFrame
@@ -179,9 +180,16 @@ def _posed_after_pnp(outcomes: Sequence[Outcome], survey: Survey, kind: CheckKin
 
 
 def _posed_adjusted(adjusted: AdjustedEpoch, survey: Survey, kind: CheckKind) -> PosedImages:
-    cameras = tuple(survey.epoch[name].camera for name in adjusted.image_ids)
+    estimated = {c["camera_id"]: _camera(c) for c in adjusted.data.get("calibrations", ())}
+    own = (survey.epoch[name].camera for name in adjusted.image_ids)
+    cameras = tuple(estimated.get(camera.camera_id, camera) for camera in own)
     joint = adjusted.joint if kind is CheckKind.ABSOLUTE else adjusted.relative_joint
     return PosedImages(adjusted.image_ids, cameras, adjusted.world_from_cams, joint)
+
+
+def _camera(data: dict[str, Any]) -> Camera:
+    """A camera as the adjustment estimated and stored it."""
+    return Camera(**{**data, "distortion": tuple(data["distortion"]), "estimate": tuple(data["estimate"])})
 
 
 def _axes_at_points(survey: Survey) -> dict[str, Array]:
@@ -201,7 +209,8 @@ def _placed(adjusted: AdjustedEpoch, survey: Survey) -> Placed:
         world=survey.world,
         new=dict(poses),
         position_covs=turned,
-        gnss_covs={image.image_id: image.gnss.cov for image in survey.epoch.images if image.gnss is not None},
+        gnss_covs={i.image_id: i.gnss.cov for i in survey.epoch.images if i.gnss is not None}
+        | {name: fix.cov for name, fix in survey.epoch.fixes.items()},
         reference={i.image_id: i.world_from_cam for i in survey.reference.images if i.world_from_cam is not None},
         check=survey.check,
         control=survey.control,

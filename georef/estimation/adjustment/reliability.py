@@ -23,6 +23,7 @@ from georef.geometry.rigid import Array
 
 ALPHA0, BETA0 = 0.001, 0.20
 DELTA0 = float(norm.ppf(1.0 - 0.5 * ALPHA0) + norm.ppf(1.0 - BETA0))
+NO_WEIGHT = 1e-9  # of the largest weight of a constraint: below it a coordinate has none
 _CHUNK = 50_000  # observations at a time
 _CHECKED = 0.01  # a redundancy number below it: next to nothing checks the observation
 
@@ -80,7 +81,8 @@ def _part(block: Block, state: State, test: TermTests, axes: Axes | None) -> Rel
     information = np.swapaxes(weight, 1, 2) @ weight
     checked = np.swapaxes(weight, 1, 2) @ test.cofactor @ weight  # P Qvv P
     power = _diagonal(checked)
-    weighted = _diagonal(information) > 0.0
+    given = _diagonal(information)
+    weighted = given > NO_WEIGHT * given.max(axis=1, keepdims=True, initial=0.0)
     # Qvv P in the observation's own units: W^-1 Qvv_w W, where rows without weight stay out.
     back = np.linalg.pinv(weight)
     redundant = back @ test.cofactor @ weight
