@@ -18,6 +18,12 @@ def symmetric(matrix: Array) -> Array:
     return 0.5 * (matrix + np.swapaxes(matrix, -1, -2))
 
 
+def information_of_rank(cov: Array, rank: int) -> Array:
+    """The inverse of a covariance in the `rank` most certain directions, nothing in the others."""
+    values, vectors = np.linalg.eigh(cov)
+    return (vectors[:, :rank] / values[:rank]) @ vectors[:, :rank].T
+
+
 def largest_position_sigma(cov: Array) -> float:
     """1-sigma of the position in the direction in which it is least certain, of a pose covariance (6, 6)."""
     return float(np.sqrt(np.linalg.eigvalsh(cov[3:, 3:])[-1]))

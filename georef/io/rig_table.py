@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from georef.geometry.angles import rotation_from_omega_phi_kappa
 from georef.geometry.panorama import head_pose
@@ -16,8 +17,8 @@ from georef.types.campaign import Mounting
 
 _ANGLES, _POSITION, _SIGMAS = ("yaw", "pitch", "roll"), ("x", "y", "z"), ("sigma_m", "sigma_deg")
 _IMAGE_ANGLES = ("omega", "phi", "kappa")
-FREE = np.array([1.0, np.degrees(1.0)])
-"""Sigmas (m, deg) of a mounting of which next to nothing is known."""
+FREE = (0.5, 5.0)
+"""Sigmas (m, deg) that localization allows a mounting that nobody states a sigma for."""
 
 
 def read_rig(
@@ -25,7 +26,6 @@ def read_rig(
     *,
     columns: Mapping[str, str] | None = None,
     table_format: TableFormat | None = None,
-    allow_free: bool = False,
 ) -> dict[str, Mounting]:
     """Read camera, x, y, z (m), yaw, pitch, roll (deg), sigma_m, sigma_deg: mountings by the ids of their cameras.
 
@@ -33,17 +33,20 @@ def read_rig(
     clockwise about the optical axis. Or omega, phi, kappa (deg): R = Rx(omega) Ry(phi) Rz(kappa) turns the image axes
     (x right, y up, z towards the viewer) of the camera to those of the rig; x, y, z stay as they are. The sigmas are of
     each coordinate and of the rotation about each axis. One camera may have both zero: then the rig is where it is.
-    allow_free: where both are empty, next to nothing is known, a metre and a radian. Raises InputError.
+    Both empty: nobody knows how good the values are; an adjustment estimates them without a weight. Raises InputError.
     """
     table = read_table(path, columns=columns, table_format=table_format)
     by_images = table.has(*_IMAGE_ANGLES)
     table.require(("camera", *_POSITION, *(_IMAGE_ANGLES if by_images else _ANGLES), *_SIGMAS))
     cameras = table.unique_ids("camera")
     angles = np.radians(table.stack(_IMAGE_ANGLES if by_images else _ANGLES))
-    sigmas = _checked_sigmas(table, cameras, allow_free)
+    sigmas, free = _checked_sigmas(table, cameras)
     positions = table.stack(_POSITION)
     pose = _pose_by_images if by_images else head_pose
-    return {name: Mounting(name, pose(angles[i], positions[i]), _cov(*sigmas[i])) for i, name in enumerate(cameras)}
+    return {
+        name: Mounting(name, pose(angles[i], positions[i]), _cov(*sigmas[i]), free=bool(free[i]))
+        for i, name in enumerate(cameras)
+    }
 
 
 def _pose_by_images(omega_phi_kappa_rad: Array, position_in_rig_m: Array) -> Rigid3:
@@ -52,8 +55,9 @@ def _pose_by_images(omega_phi_kappa_rad: Array, position_in_rig_m: Array) -> Rig
     return Rigid3(np.diag([1.0, -1.0, -1.0]) @ turned, position_in_rig_m)
 
 
-def _checked_sigmas(table: Table, cameras: tuple[str, ...], allow_free: bool) -> Array:
-    sigmas = table.stack(_SIGMAS, allow_empty=allow_free)
+def _checked_sigmas(table: Table, cameras: tuple[str, ...]) -> tuple[Array, NDArray[np.bool_]]:
+    """Sigmas (N, 2), and which mountings (N,) have none stated."""
+    sigmas = table.stack(_SIGMAS, allow_empty=True)
     free = np.isnan(sigmas)
     for i in np.flatnonzero(free.any(axis=1) & ~free.all(axis=1))[:1]:
         raise table.error(
@@ -80,7 +84,7 @@ def _checked_sigmas(table: Table, cameras: tuple[str, ...], allow_free: bool) ->
             expected="sigmas of 0 for one camera at most, the one that defines the rig.",
             remedy="Give the others the standard deviations of their calibration.",
         )
-    return sigmas
+    return sigmas, free.all(axis=1)
 
 
 def _cov(sigma_m: float, sigma_deg: float) -> Array | None:

@@ -12,6 +12,7 @@ from georef.crs import CrsDefinition, WorldFrame
 from georef.errors import InputError
 from georef.estimation.adjustment.block import Block, Distances
 from georef.evaluation.forward_intersection import Intersection, PosedImages, intersect
+from georef.geometry.covariance import information_of_rank
 from georef.geometry.rigid import Array
 from georef.io.columns import CrsKind
 from georef.io.points import PointTable, read_points
@@ -71,15 +72,9 @@ def surveyed_points(
     for k, i in enumerate(there.tolist()):
         if not marks[i]:
             logger.warning("%s: point %s is marked in no image", table.path, table.point_ids[i])
-        information = None if known[i].all() else _information(covs[k], int(known[i].sum()))
-        points.append(ControlPoint(table.point_ids[i], in_world[k], covs[k], marks[i], information))
+        partial = None if known[i].all() else information_of_rank(covs[k], int(known[i].sum()))
+        points.append(ControlPoint(table.point_ids[i], in_world[k], covs[k], marks[i], partial))
     return tuple(points)
-
-
-def _information(cov: Array, rank: int) -> Array:
-    """The inverse of a covariance in the directions that are known, the `rank` most certain ones."""
-    values, vectors = np.linalg.eigh(cov)
-    return (vectors[:, :rank] / values[:rank]) @ vectors[:, :rank].T
 
 
 def _filled(table: PointTable, marks: Sequence[tuple[Mark, ...]], started: Block, world: WorldFrame) -> Array:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,10 +11,10 @@ from georef.errors import InputError
 from georef.estimation.adjustment.block import RigCamera
 from georef.geometry.camera import Camera
 from georef.geometry.poses import Poses
-from georef.geometry.rigid import Array, Rigid3
+from georef.geometry.rigid import Rigid3
 from georef.io.exterior_orientation import ExteriorOrientationTable
 from georef.io.gnss import GnssTable
-from georef.io.rig_table import FREE, read_rig
+from georef.io.rig_table import read_rig
 from georef.io.table import IntArray
 from georef.project import Project
 from georef.sections import BlockRig
@@ -23,7 +22,6 @@ from georef.stages.block_tables import BlockTables, by_pattern, rows_of
 from georef.types.campaign import Mounting
 
 _SAME_PLACE_M = 1e-3
-_FREE_VARIANCE = np.diag([np.radians(FREE[1]) ** 2] * 3 + [FREE[0] ** 2] * 3)
 
 
 def stations_of(rig: BlockRig | None, tables: BlockTables, image_ids: Sequence[str]) -> tuple[str, ...]:
@@ -103,7 +101,7 @@ def mountings_of(
     _refuse_twice(names, image_ids, station)
     if rig.file is not None:
         path = project.data(rig.file)
-        given = read_rig(path, allow_free=True)
+        given = read_rig(path)
         _require_mounted(given, names, image_ids, str(path))
         if rig.reference is not None and rig.reference not in given:
             raise _unknown_reference(rig.reference, tuple(given), str(path))
@@ -123,11 +121,7 @@ def mountings_of(
 
 
 def _weighted(mounting: Mounting, reference: str | None) -> RigCamera:
-    if mounting.cov is None or mounting.camera == reference:
-        return RigCamera(mounting.camera, mounting.rig_from_cam)
-    if np.array_equal(np.diag(mounting.cov), np.diag(_FREE_VARIANCE)):
-        return RigCamera(mounting.camera, mounting.rig_from_cam, np.zeros((6, 6)))
-    return RigCamera(mounting.camera, mounting.rig_from_cam, cast(Array, np.linalg.inv(mounting.cov)))
+    return RigCamera.of(replace(mounting, cov=None) if mounting.camera == reference else mounting)
 
 
 def _defined(mountings: tuple[RigCamera, ...]) -> bool:

@@ -9,19 +9,21 @@ from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
+from numpy.typing import NDArray
 
 from georef.crs import CrsDefinition, WorldFrame, check_area_of_use, choose_origin, crs_kind
-from georef.errors import CrsError
+from georef.errors import CrsError, InputError
 from georef.geometry.camera import Camera
+from georef.geometry.covariance import information_of_rank
 from georef.io.columns import CrsKind, PositionTable
 from georef.io.gnss import GnssTable, read_gnss
 from georef.io.marks import check_marks, read_marks
-from georef.io.points import read_points
+from georef.io.points import PointTable, read_points
 from georef.io.rig_table import read_rig
 from georef.io.tables import check_declared_crs, check_declared_height
 from georef.project import Project
 from georef.stages.cameras import CameraTable, Stated, unknown_camera, with_unknown
-from georef.stages.mountings import with_rig
+from georef.stages.mountings import with_fixes, with_rig
 from georef.stages.panoramas import CutOut, placeholder, with_heads
 from georef.stages.reference import image_files, read_orientations, reference_campaign, table_format, world_poses
 from georef.types.campaign import Campaign, Image, PositionPrior
@@ -29,6 +31,7 @@ from georef.types.constraints import CheckKind, CheckPoint, ControlPoint, Mark
 
 __all__ = ["Survey", "load_survey", "world_poses"]
 logger = logging.getLogger(__name__)
+_APPROXIMATE_M = 1000.0  # sigma of a coordinate of control that is approximate only
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,6 +117,8 @@ def _epoch(
             image = replace(image, camera=_new_camera(name, path, table, stated, section.unknown))
         images.append(replace(image, **priors.get(name, {})))
     campaign, cutouts = with_heads(project, epoch, images, section.panorama)
+    if gnss is not None:
+        campaign = with_fixes(campaign, gnss, section)
     if section.rig is None or gnss is None:
         return campaign, cutouts
     return with_rig(campaign, read_rig(project.data(section.rig)), gnss.path, project.data(section.rig)), cutouts
@@ -152,7 +157,9 @@ def _points(
         crs_kind=kind,
         columns=section.table.columns or None,
         table_format=table_format(section.table),
+        partial=True,
     )
+    known = _known_coordinates(table)
     check_frame(table, definition)
     marks = read_marks(project.data(section.marks[epoch]), repeats="mean", table_format=table_format(section.table))
     check_marks(marks, table.point_ids, {i.image_id: (i.camera.width, i.camera.height) for i in new.images})
@@ -161,14 +168,37 @@ def _points(
         by_point.setdefault(point, []).append(Mark(image, pixel, float(sigma)))
     positions = world.world_from_crs(table.positions_in_crs)
     covs = np.zeros((len(table), 3, 3))
-    covs[:, range(3), range(3)] = np.square(table.sigmas_m)
+    covs[:, range(3), range(3)] = np.square(np.where(known, table.sigmas_m, _APPROXIMATE_M))
     covs = world.world_cov_from_crs(table.positions_in_crs, covs)
     control, check = [], []
     for index, name in enumerate(table.point_ids):
         own = tuple(by_point.get(name, ()))
         if table.roles[index] == "control":
-            control.append(ControlPoint(name, positions[index], covs[index], own))
+            partial = None if known[index].all() else information_of_rank(covs[index], int(known[index].sum()))
+            control.append(ControlPoint(name, positions[index], covs[index], own, partial))
         else:
             point_kind = table.kinds[index] or CheckKind(section.check_kind)
             check.append(CheckPoint(name, point_kind, positions[index], covs[index], own))
     return tuple(control), tuple(check)
+
+
+def _known_coordinates(table: PointTable) -> NDArray[np.bool_]:
+    """Which coordinates (N, 3) have a sigma. Raises InputError where a value is missing, of a check point any."""
+    assert table.known is not None, "a table read with `partial` says it"
+    for i in np.flatnonzero(~np.isfinite(table.positions_in_crs).all(axis=1))[:1]:
+        raise InputError(
+            f"Point {table.point_ids[i]!r} lacks a coordinate.",
+            expected="all three; those that are approximate without a sigma.",
+            remedy="Fill it in as well as you know it, and leave its sigma empty.",
+            path=table.path,
+            row=int(table.rows[i]),
+        )
+    for i in np.flatnonzero(~table.known.all(axis=1) & (np.array(table.roles) == "check"))[:1]:
+        raise InputError(
+            f"Check point {table.point_ids[i]!r} has no sigma of one of its coordinates.",
+            expected="three sigmas of a check point; control points may be known horizontally or by their height alone.",
+            remedy="Fill it in, or declare the point as control.",
+            path=table.path,
+            row=int(table.rows[i]),
+        )
+    return table.known

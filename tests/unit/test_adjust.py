@@ -8,11 +8,11 @@ from functools import lru_cache
 
 import numpy as np
 import pytest
+from georef.estimation.adjustment.adjust import Adjusted, adjust
 from scipy.stats import chi2
 
 from georef.config import AdjustConfig
 from georef.errors import GeorefError
-from georef.estimation.adjustment.adjust import Adjusted, adjust
 from georef.estimation.adjustment.problem import Orientation, Problem
 from georef.evaluation.statistics import nees
 from georef.geometry.rigid import Array

@@ -5,15 +5,15 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+from georef.estimation.adjustment.posterior import posteriors
+from georef.estimation.adjustment.solve import solve
 
 from georef.estimation.adjustment.block import KINDS_OF_POINT
 from georef.estimation.adjustment.cofactors import cofactors
 from georef.estimation.adjustment.eliminate import normal_equations
 from georef.estimation.adjustment.from_problem import Exposure, block_of
-from georef.estimation.adjustment.posterior import posteriors
 from georef.estimation.adjustment.problem import Problem
 from georef.estimation.adjustment.reference_part import ReferencePart
-from georef.estimation.adjustment.solve import solve
 from georef.estimation.adjustment.solver import solve_block
 from georef.geometry.rigid import Rigid3
 from georef.types.campaign import Mounting

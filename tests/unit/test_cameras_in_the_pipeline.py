@@ -7,10 +7,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from georef.estimation.adjustment.adjust import adjust
 from scipy.stats import chi2
 
 from georef.config import AdjustConfig, CandidatesConfig, LocalizeConfig
-from georef.estimation.adjustment.adjust import adjust
 from georef.estimation.guided import GuidedOptions, epipolar_band, epipolar_distances, guided_matches
 from georef.estimation.localization import localize_image
 from georef.evaluation.statistics import nees

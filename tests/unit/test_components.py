@@ -6,13 +6,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from georef.estimation.adjustment.adjust import adjust
+from georef.estimation.adjustment.posterior import posteriors
+from georef.estimation.adjustment.solve import Solution, solution_views, solve
 
 from georef.config import AdjustConfig
-from georef.estimation.adjustment.adjust import adjust
 from georef.estimation.adjustment.components import Component, variance_components
-from georef.estimation.adjustment.posterior import posteriors
 from georef.estimation.adjustment.problem import Problem, control_observations
-from georef.estimation.adjustment.solve import Solution, solution_views, solve
 from georef.geometry.projection import linearize
 from georef.geometry.rigid import Array
 from georef.types.scene import Observations

@@ -6,12 +6,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.stats import binom
-
 from georef.estimation.adjustment.gate import GateCount, gate_observations, gate_priors, worst_orientation
 from georef.estimation.adjustment.posterior import posteriors
-from georef.estimation.adjustment.problem import Problem
 from georef.estimation.adjustment.solve import Solution, solve
+from scipy.stats import binom
+
+from georef.estimation.adjustment.problem import Problem
 from georef.geometry.rigid import Rigid3
 from georef.types.campaign import PositionPrior
 from georef.types.scene import Observations

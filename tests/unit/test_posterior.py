@@ -7,11 +7,11 @@ from dataclasses import replace
 import gtsam
 import numpy as np
 import pytest
+from georef.estimation.adjustment.posterior import posterior, posteriors
+from georef.estimation.adjustment.solve import Solution, solve
 
 from georef.errors import GeorefError
-from georef.estimation.adjustment.posterior import posterior, posteriors
 from georef.estimation.adjustment.problem import Problem, control_observations
-from georef.estimation.adjustment.solve import Solution, solve
 from georef.geometry.rigid import Array
 from tests.worlds.blocks import Block, block, control, gnss, orientations, pose_priors, without_gcps
 

@@ -22,6 +22,7 @@ from georef.geometry.camera import Camera
 from georef.geometry.poses import Poses
 from georef.geometry.projection import Views
 from georef.geometry.rigid import Array, Rigid3
+from georef.types.campaign import Mounting
 from georef.types.scene import Observations
 
 Indices = NDArray[np.int64]
@@ -38,6 +39,14 @@ class RigCamera:
     name: str
     rig_from_cam: Rigid3
     information: Array | None = None
+
+    @staticmethod
+    def of(mounting: Mounting) -> RigCamera:
+        """Held, weighted or free, as its sigmas were stated."""
+        if mounting.free:
+            return RigCamera(mounting.camera, mounting.rig_from_cam, np.zeros((6, 6)))
+        information = None if mounting.cov is None else np.asarray(np.linalg.inv(mounting.cov), dtype=np.float64)
+        return RigCamera(mounting.camera, mounting.rig_from_cam, information)
 
 
 @dataclass(frozen=True, eq=False)
