@@ -196,7 +196,7 @@ def _known_coordinates(table: PointTable) -> NDArray[np.bool_]:
     for i in np.flatnonzero(~table.known.all(axis=1) & (np.array(table.roles) == "check"))[:1]:
         raise InputError(
             f"Check point {table.point_ids[i]!r} has no sigma of one of its coordinates.",
-            expected="three sigmas of a check point; control points may be known horizontally or by their height alone.",
+            expected="three; control points alone may be known horizontally or by their height.",
             remedy="Fill it in, or declare the point as control.",
             path=table.path,
             row=int(table.rows[i]),

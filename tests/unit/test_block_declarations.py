@@ -209,7 +209,7 @@ def test_a_free_mounting_has_empty_sigmas(tmp_path: Path) -> None:
     path.write_text(
         "camera,x,y,z,omega,phi,kappa,sigma_m,sigma_deg\nN,0,0,0,0,0,0,0,0\nF,0.1,0,0,45,0,0,,\n", encoding="utf-8"
     )
-    rig = read_rig(path, allow_free=True)
+    rig = read_rig(path)
     assert rig["N"].cov is None
     assert rig["F"].cov is not None
     # omega turns the image's y (up) towards its z (the viewer): the camera looks towards the top of the picture
