@@ -119,7 +119,7 @@ def solve_with_control(
     names = tuple(point.point_id for point in control)
     if not control:
         return solved(block, start, check, config)
-    found = adjust_block(block, options_of(config), start)
+    found = adjust_block(block, options_of(config), start=start)
     checked = check_block(found.block, found.solution.state, found.quality.cofactors.apply, check)
     marks = rejected_marks(block, found, control)
     return Solved(found.block, found.solution, found.quality, checked, found.rejected, marks, names)
