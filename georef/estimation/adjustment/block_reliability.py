@@ -89,7 +89,7 @@ def _given(found: Solved, name: str) -> Given | None:
     test: TermTests | None = next((t for t in found.quality.constraints if t.name == name), None)
     if test is None or not len(test.row):
         return None
-    return Given(reliability(found.block, test), test.statistic, test.dof)
+    return Given(reliability(found.block, found.solution.state, test), test.statistic, test.dof)
 
 
 def _three(values: Array) -> tuple[float, float, float]:

@@ -4,28 +4,60 @@ from __future__ import annotations
 
 from georef.estimation.adjustment.batches import BATCH
 from georef.estimation.adjustment.kernels import kernel, lens
-from georef.estimation.adjustment.kernels_points import loss
+from georef.estimation.adjustment.kernels_points import linearize, loss, share
 
 
 @kernel
-def move_points(tracks, images, pairs, placed, moved, points, damping, cauchy, hidden_square, step, back, moved_points):
+def move_points(
+    tracks, images, pairs, placed, moved, points, damping, cauchy, hidden_square, step, back, moved_points, work
+):
     """Fills moved_points (P, 3) by back-substitution of step (6 S + B,), which leads from `placed` to `moved`; `back`
     is of the elimination at `placed` with this damping.
 
     The cost of the image observations after the step with hidden_square for the squared residual of one that no lens
     shows, how many those are, and the sum of the squared steps of points times the diagonal of their normal matrices.
     """
-    cost, hidden, squares = 0.0, 0, 0.0
+    cost, hidden, squares, by_shared = 0.0, 0, 0.0, work.slots.right
+    shared = images.mounting_column.max() >= 0 or images.calibration_column.max() >= 0
+    by_shared[:] = 0.0
     for begin in range(0, tracks.point.shape[0], BATCH):
         end = min(begin + BATCH, tracks.point.shape[0])
-        squares += _move(tracks, begin, end, images, pairs.slot, placed, points, damping, step, back, moved_points)
+        if shared:
+            _sum_shared(tracks, begin, end, images, placed, points, cauchy, step, work.rays, work.slots)
+        squares += _move(
+            tracks, begin, end, images, pairs.slot, placed, points, damping, step, back, by_shared, moved_points
+        )
         more, unseen = _cost(tracks, begin, end, images, moved, moved_points, cauchy, hidden_square)
         cost, hidden = cost + more, hidden + unseen
     return cost, hidden, squares
 
 
 @kernel
-def _move(tracks, begin, end, images, slot, placed, points, damping, step, back, moved_points):
+def _sum_shared(tracks, begin, end, images, placed, points, cauchy, step, rays, slots):
+    """W' step of the mountings and calibrations that a batch's points are seen through, in `right` of the slots."""
+    linearize(tracks, begin, end, images, placed, points, cauchy, rays, slots)
+    share(tracks, begin, end, images, placed, rays)
+    r, g, unknown, offset = placed.rig_rotation, rays.by_rig, 6 * placed.rig_rotation.shape[0], tracks.start[begin]
+    for track in range(begin, end):
+        wx, wy, wz = 0.0, 0.0, 0.0
+        for o in range(tracks.start[track] - offset, tracks.start[track + 1] - offset):
+            if rays.slot[o] < 0 or not rays.columns[o]:
+                continue
+            u, v, s = 0.0, 0.0, slots.station[rays.slot[o]]
+            for a in range(rays.columns[o]):
+                change = step[unknown + rays.column[o, a]]
+                u, v = u + rays.shared[o, 0, a] * change, v + rays.shared[o, 1, a] * change
+            x = g[o, 0, 0] * u + g[o, 1, 0] * v
+            y = g[o, 0, 1] * u + g[o, 1, 1] * v
+            z = g[o, 0, 2] * u + g[o, 1, 2] * v
+            wx += r[s, 0, 0] * x + r[s, 1, 0] * y + r[s, 2, 0] * z
+            wy += r[s, 0, 1] * x + r[s, 1, 1] * y + r[s, 2, 1] * z
+            wz += r[s, 0, 2] * x + r[s, 1, 2] * y + r[s, 2, 2] * z
+        slots.right[track - begin, 0], slots.right[track - begin, 1], slots.right[track - begin, 2] = wx, wy, wz
+
+
+@kernel
+def _move(tracks, begin, end, images, slot, placed, points, damping, step, back, by_shared, moved_points):
     """Points after the step; the sum of their squared steps times the diagonal of their normal matrices."""
     r, t, unknown, squares = placed.rig_rotation, placed.rig_translation, 6 * placed.rig_rotation.shape[0], 0.0
     for track in range(begin, end):
@@ -35,7 +67,8 @@ def _move(tracks, begin, end, images, slot, placed, points, damping, step, back,
             for i in range(3):
                 moved_points[point, i] = points[point, i] + step[unknown + kept + i]
             continue
-        wx, wy, wz, s, m = 0.0, 0.0, 0.0, -1, slot[track] - 1  # W' step
+        wx, wy, wz = by_shared[track - begin, 0], by_shared[track - begin, 1], by_shared[track - begin, 2]  # W' step
+        s, m = -1, slot[track] - 1
         for at in range(tracks.start[track], tracks.start[track + 1]):
             here = images.station[tracks.image[at]]
             if here == s:
