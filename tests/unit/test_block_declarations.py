@@ -215,7 +215,8 @@ def test_a_free_mounting_has_empty_sigmas(tmp_path: Path) -> None:
     # omega turns the image's y (up) towards its z (the viewer): the camera looks towards the top of the picture
     axis = rig["F"].rig_from_cam.rotation[:, 2]
     assert axis == pytest.approx([0.0, -np.sqrt(0.5), np.sqrt(0.5)])
-    assert rig["F"].free and not rig["N"].free
+    assert rig["F"].free
+    assert not rig["N"].free
     path.write_text(path.read_text(encoding="utf-8").replace("45,0,0,,", "45,0,0,0.1,"), encoding="utf-8")
     with pytest.raises(InputError, match="one of sigma_m, sigma_deg"):
         read_rig(path)
