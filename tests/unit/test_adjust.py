@@ -13,10 +13,11 @@ from scipy.stats import chi2
 from georef.errors import GeorefError
 from georef.estimation.adjustment.constraint_terms import POSITION_PRIORS
 from georef.estimation.adjustment.eliminate import IMAGE_OBSERVATIONS
-from georef.estimation.adjustment.problem import Problem
+from georef.estimation.adjustment.problem import Orientation, Problem
 from georef.evaluation.statistics import nees
 from georef.geometry.projection import Views
 from georef.geometry.rigid import Array
+from georef.types.campaign import PosePrior
 from georef.types.constraints import CheckKind, CheckPoint
 from tests.worlds import adjusted as worlds
 from tests.worlds.adjusted import adjusted
@@ -188,6 +189,15 @@ def test_check_points_cannot_enter() -> None:
     check = CheckPoint("C1", CheckKind.ABSOLUTE, point.point_in_world, point.cov, point.marks)
     with pytest.raises(TypeError, match="control points"):
         replace(made.problem, control=(point, check))  # pyright: ignore[reportArgumentType]
+
+
+def test_an_image_has_one_kind_of_pose() -> None:
+    made = block(1, points=60)
+    pose = made.world.queries[0]
+    given = Orientation(pose, np.full(3, 0.01), np.full(3, 1e-4))
+    with pytest.raises(ValueError, match="either"):
+        replace(made.problem, orientations={0: given}, pose_priors={0: PosePrior(pose, given.cov)})
+    replace(made.problem, orientations={0: given}, pose_priors={1: PosePrior(pose, given.cov)})
 
 
 def test_no_datum_is_an_error() -> None:
