@@ -17,7 +17,7 @@ from georef.config import AdjustConfig, NetworkConfig
 from georef.errors import StageError
 from georef.estimation.adjustment.block import Block
 from georef.estimation.adjustment.components import Component
-from georef.estimation.adjustment.network import AdjustedNetwork, adjust_network, network_block
+from georef.estimation.adjustment.network import AdjustedNetwork, adjust_network, network_block, worst_orientation
 from georef.estimation.guided import GuidedOptions, PosedFeatures, epipolar_band, guided_matches
 from georef.estimation.smooth_errors import Residuals, SmoothErrors, smooth_errors
 from georef.estimation.tracks import (
@@ -117,7 +117,7 @@ def estimate_noise(
     block = _set_aside(block, suspects)
     while True:
         noise, adjusted = _iterated(block, noise, adjust_config, estimate_poses=declared is None)
-        worst = adjusted.worst_orientation(adjust_config.gate_probability)
+        worst = worst_orientation(adjusted.block, adjusted.quality, adjust_config.gate_probability)
         if worst is None or len(suspects) >= limit:
             break
         suspects.append(worst)

@@ -6,40 +6,40 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from georef.estimation.adjustment.adjust import adjust
-from georef.estimation.adjustment.posterior import posteriors
-from georef.estimation.adjustment.solve import Solution, solution_views, solve
 
-from georef.config import AdjustConfig
-from georef.estimation.adjustment.components import Component, variance_components
-from georef.estimation.adjustment.problem import Problem, control_observations
+from georef.estimation.adjustment import block as adjustment
+from georef.estimation.adjustment.block import KINDS_OF_POINT, KINDS_OF_POSE
+from georef.estimation.adjustment.components import Component
+from georef.estimation.adjustment.constraint_terms import POSITION_PRIORS
+from georef.estimation.adjustment.eliminate import IMAGE_OBSERVATIONS
+from georef.estimation.adjustment.network import orientation_components
 from georef.geometry.projection import linearize
 from georef.geometry.rigid import Array
-from georef.types.scene import Observations
-from tests.worlds.blocks import block, control, gnss, orientations, pose_priors
+from tests.worlds.adjusted import Solved, adjusted, images_alone
+from tests.worlds.blocks import block, control, gnss, orientations, pose_priors, with_orientations
 from tests.worlds.points import NOISE, scaled_noise
 
 _EXACT = scaled_noise(NOISE, poses=1e-6)
-_CONFIG = AdjustConfig()
 
 
-def everything(seed: int) -> Problem:
+def everything(seed: int) -> adjustment.Block:
     """All kinds of constraints at once; orientations and pose priors on different images."""
     made, rng = block(seed, noise=_EXACT, points=70), np.random.default_rng([seed, 8])
     given, priors = orientations(made.world, rng, 0.01, 3e-4), pose_priors(made.world, rng)
-    return replace(
+    problem = replace(
         made.problem,
-        orientations={0: given[0], 1: given[1]},
         pose_priors={2: priors[2]},
         position_priors=gnss(made.world, rng, 0.05),
         control=control(made.world, rng, count=3),
     )
+    return with_orientations(images_alone(problem), given, (0, 1))
 
 
-def hat_traces(problem: Problem, solution: Solution) -> dict[str, float]:
+def hat_traces(found: Solved) -> dict[str, float]:
     """tr(A Qxx A' P) of each group, from one dense whitened design matrix of all unknowns."""
-    images, points = len(problem.image_ids), len(problem.points)
-    size = 6 * images + 3 * points + 3 * len(problem.control)
+    whole, state, poses = found.block, found.state, found.poses
+    images = len(whole.image_ids)
+    size = 6 * images + 3 * len(whole.points)
     rows: list[tuple[str, np.ndarray]] = []
 
     def add(group: str, blocks: dict[int, Array], cov: Array) -> None:
@@ -48,26 +48,21 @@ def hat_traces(problem: Problem, solution: Solution) -> dict[str, float]:
             row[:, column : column + part.shape[1]] = part
         rows.append((group, np.linalg.solve(np.linalg.cholesky(cov), row)))
 
-    def add_images(obs: Observations, positions: Array, first: int) -> None:
-        lin = linearize(solution_views(problem, solution), obs.view, positions[obs.point])
-        for i in range(len(obs)):
-            columns = {6 * int(obs.view[i]): lin.by_pose[i], first + 3 * int(obs.point[i]): lin.by_point[i]}
-            add("image_observations", columns, np.eye(2) * obs.sigma_px[i] ** 2)
-
-    add_images(problem.observations, solution.points, 6 * images)
-    add_images(control_observations(problem), solution.control_points, 6 * images + 3 * points)
-    for point, cov in zip(problem.gcps.point, problem.gcps.cov, strict=True):
-        add("image_observations", {6 * images + 3 * int(point): np.eye(3)}, cov)
-    for i, point in enumerate(problem.control):
-        add("control_points", {6 * images + 3 * points + 3 * i: np.eye(3)}, point.cov)
-    for i, given in problem.orientations.items():
-        add("reference_rotation", {6 * i: np.eye(3)}, np.diag(given.rotation_sigma_rad**2))
-        rotation = solution.world_from_cams[i].rotation
-        add("reference_position", {6 * i + 3: rotation}, np.diag(given.position_sigma_m**2))
-    for i, prior in problem.pose_priors.items():
-        add("pose_priors", {6 * i: np.eye(6)}, prior.cov)
-    for i, position in problem.position_priors.items():
-        add("gnss", {6 * i + 3: solution.world_from_cams[i].rotation}, position.cov)
+    obs, lin = (
+        whole.observations,
+        linearize(whole.views(state), whole.observations.view, state.points[whole.observations.point]),
+    )
+    for i in range(len(obs)):
+        columns = {6 * int(obs.view[i]): lin.by_pose[i], 6 * images + 3 * int(obs.point[i]): lin.by_point[i]}
+        add(IMAGE_OBSERVATIONS, columns, np.eye(2) * obs.sigma_px[i] ** 2)
+    points, given, positions = whole.point_priors, whole.pose_priors, whole.position_priors
+    for point, information, kind in zip(points.point, points.information, points.kind, strict=True):
+        cov = np.asarray(np.linalg.inv(information), dtype=np.float64)
+        add(KINDS_OF_POINT[kind], {6 * images + 3 * int(point): np.eye(3)}, cov)
+    for image, cov, kind in zip(given.image, given.cov, given.kind, strict=True):
+        add(KINDS_OF_POSE[kind], {6 * int(image): np.eye(6)}, cov)
+    for station, cov in zip(positions.station, positions.cov, strict=True):
+        add(POSITION_PRIORS, {6 * int(station) + 3: poses[station].rotation}, cov)
     names = np.concatenate([[name] * len(row) for name, row in rows])
     basis, _ = np.linalg.qr(np.concatenate([row for _, row in rows]))
     leverage = np.square(basis).sum(axis=1)
@@ -75,18 +70,43 @@ def hat_traces(problem: Problem, solution: Solution) -> dict[str, float]:
 
 
 def test_redundancies_are_those_of_the_full_design_matrix_and_add_up() -> None:
-    problem = everything(1)
-    solution = solve(problem, cauchy_scale=None, max_iterations=30)
-    found = variance_components(problem, solution, posteriors(problem, solution)[0])
-    expected = hat_traces(problem, solution)
-    assert set(found) == set(expected)
-    for name, component in found.items():
+    found = Solved.of(everything(1))
+    expected, groups = hat_traces(found), found.quality.components
+    assert set(groups) == set(expected) == {IMAGE_OBSERVATIONS, *KINDS_OF_POINT, *KINDS_OF_POSE, POSITION_PRIORS}
+    for name, component in groups.items():
         # first order: the derivative of Log at a residual of a pose prior
         assert component.redundancy == pytest.approx(component.observations - expected[name], abs=0.02), name
-    observations = sum(component.observations for component in found.values())
-    unknowns = 6 * len(problem.image_ids) + 3 * len(problem.points) + 3 * len(problem.control)
-    assert sum(c.redundancy for c in found.values()) == pytest.approx(observations - unknowns)
+    observations = sum(component.observations for component in groups.values())
+    unknowns = 6 * len(found.block.image_ids) + 3 * len(found.block.points)
+    assert sum(c.redundancy for c in groups.values()) == pytest.approx(observations - unknowns)
     assert sum(expected.values()) == pytest.approx(unknowns)
+
+
+def test_positions_and_rotations_of_orientations_have_components_of_their_own() -> None:
+    """Against residuals and cofactors of the poses themselves, and adding up to that of the orientations."""
+    found = Solved.of(everything(2))
+    whole = orientation_components(found.quality)
+    both = found.quality.components["orientation"]
+    expected = {"reference_position": [0.0, 0.0], "reference_rotation": [0.0, 0.0]}
+    given = found.block.pose_priors
+    for row in np.flatnonzero(given.kind == KINDS_OF_POSE.index("orientation")):
+        image = int(given.image[row])
+        pose, prior = found.poses[image], given.world_from_cam[int(row)]
+        cov = found.cofactors[6 * image : 6 * image + 6, 6 * image : 6 * image + 6]
+        offset, turn = pose.translation - prior.translation, prior.local(pose)[:3]
+        in_world = pose.rotation @ cov[3:, 3:] @ pose.rotation.T
+        for name, residual, fitted, sigma in (
+            ("reference_position", offset, in_world, 0.01),
+            ("reference_rotation", turn, cov[:3, :3], 3e-4),
+        ):
+            expected[name][0] += 3.0 - np.trace(fitted) / sigma**2
+            expected[name][1] += np.sum(np.square(residual)) / sigma**2
+    for name, (redundancy, squares) in expected.items():
+        assert whole[name].observations == 6
+        assert whole[name].redundancy == pytest.approx(redundancy, abs=2e-3), name
+        assert whole[name].squares == pytest.approx(squares, rel=2e-3), name
+    assert sum(part.squares for part in whole.values()) == pytest.approx(both.squares)
+    assert sum(part.redundancy for part in whole.values()) == pytest.approx(both.redundancy)
 
 
 @pytest.mark.parametrize("factor", [0.5, 2.0])
@@ -94,16 +114,22 @@ def test_misstated_keypoint_sigma_is_recovered(factor: float) -> None:
     """Stated sigmas are `factor` times the true ones: the scale of the adjustment is 1 / factor."""
     scales, left = [], []
     for seed in range(4):
-        adjusted = adjust(block(seed, noise=_EXACT, points=250).problem.scaled(factor), _CONFIG)
-        scales.append(adjusted.sigma_scale)
-        left.append(adjusted.components["image_observations"].factor)
+        found = adjusted(scaled(images_alone(block(seed, noise=_EXACT, points=250).problem), factor))
+        scales.append(found.adjusted.sigma_scale)
+        left.append(found.quality.components[IMAGE_OBSERVATIONS].factor)
     assert np.mean(scales) * factor == pytest.approx(1.0, abs=0.04)
     assert left == pytest.approx([1.0] * 4, abs=0.06)
 
 
+def scaled(whole: adjustment.Block, factor: float) -> adjustment.Block:
+    """The sigmas of all keypoints scaled, those behind the automatic GCPs included."""
+    points = replace(whole.point_priors, information=whole.point_priors.information / factor**2)
+    return replace(whole, observations=whole.observations.scaled(factor), point_priors=points)
+
+
 @pytest.mark.parametrize("factor", [0.5, 2.0])
 def test_misstated_gnss_and_control_sigmas_show_in_their_factors_alone(factor: float) -> None:
-    found: dict[str, list[Component]] = {"gnss": [], "control_points": [], "image_observations": []}
+    found: dict[str, list[Component]] = {POSITION_PRIORS: [], "control": [], IMAGE_OBSERVATIONS: []}
     for seed in range(12):
         made, rng = block(seed, noise=_EXACT, points=90), np.random.default_rng([seed, 10])
         priors = gnss(made.world, rng, 0.05)
@@ -112,11 +138,10 @@ def test_misstated_gnss_and_control_sigmas_show_in_their_factors_alone(factor: f
             position_priors={i: replace(p, cov=p.cov * factor**2) for i, p in priors.items()},
             control=tuple(replace(p, cov=p.cov * factor**2) for p in control(made.world, rng, sigma_m=0.03)),
         )
-        solution = solve(problem, cauchy_scale=None, max_iterations=30)
-        components = variance_components(problem, solution, posteriors(problem, solution)[0])
+        components = Solved.of(images_alone(problem)).quality.components
         for name, values in found.items():
             values.append(components[name])
-    for name, expected in (("gnss", 1.0 / factor), ("control_points", 1.0 / factor), ("image_observations", 1.0)):
+    for name, expected in ((POSITION_PRIORS, 1.0 / factor), ("control", 1.0 / factor), (IMAGE_OBSERVATIONS, 1.0)):
         squares, redundancy = (sum(getattr(c, key) for c in found[name]) for key in ("squares", "redundancy"))
         pooled = Component(0, redundancy, squares)
         assert pooled.factor is not None

@@ -6,24 +6,40 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from georef.estimation.adjustment.gate import GateCount, gate_observations, gate_priors, worst_orientation
-from georef.estimation.adjustment.posterior import posteriors
-from georef.estimation.adjustment.solve import Solution, solve
 from scipy.stats import binom
 
-from georef.estimation.adjustment.problem import Problem
+from georef.estimation.adjustment import block as adjustment
+from georef.estimation.adjustment.adjust_block import quality
+from georef.estimation.adjustment.block_gates import without_contradictions
+from georef.estimation.adjustment.constraint_terms import POSITION_PRIORS
+from georef.estimation.adjustment.eliminate import IMAGE_OBSERVATIONS
+from georef.estimation.adjustment.group_tests import constraint_tests
+from georef.estimation.adjustment.network import worst_orientation
+from georef.estimation.adjustment.solver import solve_block
+from georef.geometry.poses import Poses
 from georef.geometry.rigid import Rigid3
 from georef.types.campaign import PositionPrior
 from georef.types.scene import Observations
-from tests.worlds.blocks import Block, block, control, gnss, orientations, pose_priors, without_gcps
+from tests.worlds.adjusted import Solved, adjusted, images_alone
+from tests.worlds.blocks import (
+    Block,
+    block,
+    control,
+    gnss,
+    orientations,
+    pose_priors,
+    with_orientations,
+    without_gcps,
+)
 from tests.worlds.points import NOISE, scaled_noise
 
 _EXACT = scaled_noise(NOISE, poses=1e-6)
 _PROBABILITY = 0.9  # low, so that few runs show the rate
 
 
-def solved(problem: Problem) -> Solution:
-    return solve(problem, cauchy_scale=None, max_iterations=20)
+def robust(whole: adjustment.Block) -> Solved:
+    state = solve_block(whole, losses={IMAGE_OBSERVATIONS: 2.0, "automatic": 2.0}).state
+    return Solved(whole, state, quality(whole, state))
 
 
 def exact_block(seed: int, **options: int) -> tuple[Block, np.random.Generator]:
@@ -37,8 +53,8 @@ def assert_rate(rejected: int, tested: int, rate: float) -> None:
 
 
 def test_priors_are_falsely_rejected_at_the_stated_rate() -> None:
-    rejected = {"gnss": 0, "pose_priors": 0, "control_points": 0}
-    tested = dict(rejected)
+    rejected = {POSITION_PRIORS: 0, "localized": 0, "control": 0}
+    tested = 0
     for seed in range(30):
         made, rng = exact_block(seed)
         problem = replace(
@@ -47,16 +63,17 @@ def test_priors_are_falsely_rejected_at_the_stated_rate() -> None:
             pose_priors=pose_priors(made.world, rng),
             control=control(made.world, rng, count=4),
         )
-        solution = solved(problem)
-        kept, gates = gate_priors(problem, solution, *posteriors(problem, solution), _PROBABILITY)
-        for name, count in gates.items():
-            tested[name] += count.tested
-            rejected[name] += count.rejected
-        assert len(kept.position_priors) == 4 - gates["gnss"].rejected
-        assert len(kept.pose_priors) == 4 - gates["pose_priors"].rejected
-        assert len(kept.control) == 4 - gates["control_points"].rejected
+        found = Solved.of(images_alone(problem))
+        kept, bad = without_contradictions(found.block, found.quality.constraints, _PROBABILITY)
+        tested += 4
+        count = {name: sum(r.kind == name for r in bad) for name in rejected}
+        rejected = {name: rejected[name] + count[name] for name in rejected}
+        assert len(kept.position_priors) == 4 - count[POSITION_PRIORS]
+        assert len(kept.pose_priors) == 4 - count["localized"]
+        assert len(kept.point_priors) == 4 - count["control"]
+        assert all(r.statistic > 4.0 and r.dof > 0 for r in bad)
     for name in rejected:
-        assert_rate(rejected[name], tested[name], 1.0 - _PROBABILITY)
+        assert_rate(rejected[name], tested, 1.0 - _PROBABILITY)
 
 
 def test_errors_that_references_share_are_not_held_against_control_points() -> None:
@@ -64,12 +81,13 @@ def test_errors_that_references_share_are_not_held_against_control_points() -> N
     for seed in range(15):
         made, rng = block(seed, points=90), np.random.default_rng([seed, 6])
         problem = replace(made.problem, control=control(made.world, rng, count=5, sigma_m=0.003, mark_px=0.3))
-        solution = solved(problem)
-        cofactors, posterior = posteriors(problem, solution)
-        _, gates = gate_priors(problem, solution, cofactors, posterior, 0.99)
-        _, naive = gate_priors(problem, solution, cofactors, cofactors, 0.99)
-        rejected += gates["control_points"].rejected
-        naively += naive["control_points"].rejected
+        found = Solved.of(images_alone(problem))
+        part = found.quality
+        naive = constraint_tests(found.block, found.state, part.cofactors, part.images.points)
+        for tests, honest in ((part.constraints, True), (naive, False)):
+            _, bad = without_contradictions(found.block, tests, 0.99)
+            count = sum(r.kind == "control" for r in bad)
+            rejected, naively = rejected + honest * count, naively + (not honest) * count
     assert rejected <= 3  # of 75
     assert naively >= 5
 
@@ -81,10 +99,12 @@ def test_observations_are_falsely_rejected_at_the_stated_rate_whatever_their_sig
     for seed in range(10):
         made, rng = exact_block(seed, queries=3)
         problem = replace(without_gcps(made.problem), pose_priors=pose_priors(made.world, rng))
-        problem = problem.restricted(_first_two(problem.observations), np.zeros(0, bool)).scaled(stated)
-        gated, dropped = gate_observations(problem, solved(problem), 0.99)
-        assert dropped == len(problem.observations) - len(gated.observations)
-        rejected, tested = rejected + dropped // 2, tested + len(problem.observations) // 2  # both of a point together
+        problem = problem.restricted(_first_two(problem.observations), np.zeros(0, bool))
+        problem = replace(problem, observations=problem.observations.scaled(stated))
+        images = Solved.of(images_alone(problem)).quality.images
+        # Both observations of a point have the same test, beside what the poses add.
+        dropped = int(images.rejected(0.99, images.scale).sum())
+        rejected, tested = rejected + dropped // 2, tested + len(problem.observations) // 2
     assert_rate(rejected, tested, 0.01)
 
 
@@ -97,45 +117,48 @@ def _first_two(obs: Observations) -> np.ndarray:
     return keep
 
 
-def test_blunders_behind_cameras_and_wrong_pixels_leave() -> None:
+def test_wrong_pixels_leave_and_healthy_ones_stay() -> None:
     made, _ = exact_block(3)
-    problem, solution = made.problem, solved(made.problem)
-    rng = np.random.default_rng(3)
+    problem, rng = made.problem, np.random.default_rng(3)
     wrong = rng.permutation(len(problem.observations))[:12]
     pixel = problem.observations.pixel.copy()
     pixel[wrong] += 40.0
-    spoilt = replace(problem, observations=replace(problem.observations, pixel=pixel))
-    robust = solve(spoilt, cauchy_scale=2.0, max_iterations=30)
-    gated, dropped = gate_observations(spoilt, robust, 0.999)
-    left = {tuple(p) for p in gated.observations.pixel.tolist()}
-    assert not left & {tuple(p) for p in pixel[wrong].tolist()}
-    assert dropped < 12 + 0.03 * len(pixel)
-    turned = Rigid3(
-        solution.world_from_cams[0].rotation @ np.diag([1.0, -1.0, -1.0]), problem.world_from_cams[0].translation
-    )
-    behind = replace(solution, world_from_cams=(turned, *solution.world_from_cams[1:]))
-    gated, _ = gate_observations(problem, behind, 0.999)
-    assert not (gated.observations.view == 0).any()
+    whole = images_alone(replace(problem, observations=replace(problem.observations, pixel=pixel)))
+    images = robust(whole).quality.images
+    bad = images.rejected(0.999, images.scale)
+    assert bad[wrong].all()
+    assert bad.sum() < 12 + 0.03 * len(pixel)
+
+
+def test_what_is_behind_a_camera_fails() -> None:
+    made, rng = exact_block(3)
+    whole = images_alone(replace(made.problem, pose_priors=pose_priors(made.world, rng)))
+    state, images = Solved.of(whole).state, whole.observations.view
+    turned = state.world_from_rig.rotation.copy()
+    turned[0] = turned[0] @ np.diag([1.0, -1.0, -1.0])
+    behind = replace(state, world_from_rig=replace(state.world_from_rig, rotation=turned))
+    bad = quality(whole, behind).images.rejected(0.999)
+    assert bad[images == 0].all()
 
 
 def test_automatic_gcps_that_contradict_leave_and_their_points_may_stay() -> None:
     made, _ = exact_block(4)
-    problem = made.problem
-    position = problem.gcps.position.copy()
+    position = made.problem.gcps.position.copy()
     position[::10] += [0.0, 0.0, 1.0]
-    spoilt = replace(problem, gcps=replace(problem.gcps, position=position))
-    gated, _ = gate_observations(spoilt, solve(spoilt, cauchy_scale=2.0, max_iterations=30), 0.999)
-    known = {tuple(p) for p in gated.gcps.position.tolist()}
+    whole = images_alone(replace(made.problem, gcps=replace(made.problem.gcps, position=position)))
+    found = adjusted(whole)
+    known = {tuple(p) for p in found.block.point_priors.position.tolist()}
     assert not known & {tuple(p) for p in position[::10].tolist()}
     assert len(known) > 0.95 * (len(position) - len(position[::10]))
-    assert len(gated.points) > len(gated.gcps)
-    np.testing.assert_array_equal(np.unique(gated.observations.point), np.arange(len(gated.points)))
+    seen = np.unique(found.block.observations.point)
+    wrong = whole.point_priors.point[::10]
+    assert len(np.intersect1d(seen, wrong)) > 0.5 * len(wrong)
 
 
 def test_what_nothing_checks_is_never_rejected() -> None:
     """One orientation fixes all but the scale; a distance 1 m wrong passes for that, until a second one is there."""
     made, rng = exact_block(5)
-    start = replace(without_gcps(made.problem), orientations={0: orientations(made.world, rng, 0.01, 3e-4)[0]})
+    given = orientations(made.world, rng, 0.01, 3e-4)
 
     def distance_to(image: int, off_m: float) -> PositionPrior:
         """The distance of an image from image 0 to 2 cm, nothing else."""
@@ -147,28 +170,22 @@ def test_what_nothing_checks_is_never_rejected() -> None:
         )
 
     for priors, rejected in (({3: distance_to(3, 1.0)}, 0), ({3: distance_to(3, 1.0), 2: distance_to(2, 0.0)}, 2)):
-        problem = replace(start, position_priors=priors)
-        solution = solve(problem, cauchy_scale=None, max_iterations=40)
-        _, gates = gate_priors(problem, solution, *posteriors(problem, solution), 0.999)
-        assert gates["gnss"].rejected == rejected
-        assert worst_orientation(problem, solution, posteriors(problem, solution)[0], 0.999) is None
+        problem = replace(without_gcps(made.problem), position_priors=priors)
+        found = Solved.of(with_orientations(images_alone(problem), given, [0]))
+        _, bad = without_contradictions(found.block, found.quality.constraints, 0.999)
+        assert sum(r.kind == POSITION_PRIORS for r in bad) == rejected
+        assert worst_orientation(found.block, found.quality, 0.999) is None
 
 
 def test_the_worst_orientation_is_the_wrong_one() -> None:
-    found = []
+    worst = []
     for seed in range(6):
         made, rng = exact_block(seed, queries=6)
-        given = orientations(made.world, rng, 0.01, 3e-4)
+        given, whole = orientations(made.world, rng, 0.01, 3e-4), images_alone(without_gcps(made.problem))
         for shift in (0.0, 0.15):
-            pose = given[2].world_from_cam
-            wrong = replace(
-                given[2], world_from_cam=Rigid3(pose.rotation, pose.translation + np.array([0.0, shift, 0.0]))
-            )
-            problem = replace(without_gcps(made.problem), orientations={**given, 2: wrong})
-            solution = solved(problem)
-            found.append(worst_orientation(problem, solution, posteriors(problem, solution)[0], 0.9999))
-    assert found == [None, 2] * 6
-
-
-def test_two_rounds_of_a_gate_count_together() -> None:
-    assert GateCount(10, 1, ("a",)).then(GateCount(9, 2, ("b", "c"))) == GateCount(10, 3, ("a", "b", "c"))
+            poses = given.world_from_cam.to_list()
+            poses[2] = Rigid3(poses[2].rotation, poses[2].translation + np.array([0.0, shift, 0.0]))
+            wrong = replace(given, world_from_cam=Poses.of(poses))
+            found = Solved.of(with_orientations(whole, wrong, range(6)))
+            worst.append(worst_orientation(found.block, found.quality, 0.9999))
+    assert worst == [None, 2] * 6

@@ -45,24 +45,29 @@ class AdjustedNetwork:
     sigma_scale: float
 
     @property
-    def orientations(self) -> TermTests:
-        """The tests of the given orientations, those of row i of image `block.pose_priors.image[i]`."""
-        return next(test for test in self.quality.constraints if test.name == ORIENTATION)
-
-    @property
     def components(self) -> dict[str, Component]:
         """Variance components of positions and rotations of the orientations, each for itself, and of the images."""
-        rotation, position = (_part(self.orientations, part) for part in (slice(3), slice(3, 6)))
         images = self.quality.components[IMAGE_OBSERVATIONS]
-        return {"reference_position": position, "reference_rotation": rotation, "image_observations": images}
+        return {**orientation_components(self.quality), "image_observations": images}
 
-    def worst_orientation(self, probability: float) -> int | None:
-        """The image whose given orientation contradicts the rest most; None if all pass at a probability that good
-        ones pass."""
-        test = self.orientations
-        statistic = np.where(test.rejected(probability), test.statistic, -np.inf)
-        worst = int(np.argmax(statistic))
-        return int(self.block.pose_priors.image[test.row[worst]]) if np.isfinite(statistic[worst]) else None
+
+def orientation_components(found: Quality) -> dict[str, Component]:
+    """Variance components of positions and of rotations of given orientations whose covariances do not mix them."""
+    rotation, position = (_part(_orientations(found), part) for part in (slice(3), slice(3, 6)))
+    return {"reference_position": position, "reference_rotation": rotation}
+
+
+def worst_orientation(block: Block, found: Quality, probability: float) -> int | None:
+    """The image whose given orientation contradicts the rest most; None if all pass at a probability that good ones
+    pass."""
+    test = _orientations(found)
+    statistic = np.where(test.rejected(probability), test.statistic, -np.inf)
+    worst = int(np.argmax(statistic))
+    return int(block.pose_priors.image[test.row[worst]]) if np.isfinite(statistic[worst]) else None
+
+
+def _orientations(found: Quality) -> TermTests:
+    return next(test for test in found.constraints if test.name == ORIENTATION)
 
 
 def network_block(
