@@ -14,10 +14,10 @@ import numpy as np
 from georef.estimation.adjustment.block import Indices, State
 from georef.estimation.adjustment.block_cholesky import BlockCholesky, Pattern, SingularMatrix
 from georef.estimation.adjustment.eliminate import Linearized, Losses
-from georef.estimation.adjustment.equations import BlockEquations, Moved
+from georef.estimation.adjustment.equations import BlockEquations
 from georef.estimation.adjustment.partition import Part
 from georef.estimation.adjustment.reduced import Reduced
-from georef.estimation.adjustment.reduced_solve import _half_solved
+from georef.estimation.adjustment.solver import promised_decrease
 from georef.geometry.rigid import Array
 
 
@@ -48,6 +48,18 @@ class Condensed:
     singular: int = -1
 
 
+@dataclass(frozen=True, eq=False)
+class Led:
+    """What a step does in a part: what is inside moves by own (6 I,), its points are then points (P, 3); cost and
+    hidden as in `Moved`, and the decrease of the cost that the linear model promised."""
+
+    own: Array
+    points: Array
+    cost: float
+    promised: float
+    hidden: int
+
+
 class PartEquations:
     """One part at work: it keeps its observations, its points, and its factor between calls."""
 
@@ -58,6 +70,7 @@ class PartEquations:
         self._points, self._after = part.block.points, part.block.points
         self._state: State = part.block.start()
         self._damping = 0.0
+        self._told: tuple[float, Array, Array] = (0.0, np.zeros(0), np.zeros(0))  # gain, gradient, diagonal
 
     def linearized(self, given: Given) -> Condensed:
         """Linearises, eliminates points and what is inside."""
@@ -67,6 +80,7 @@ class PartEquations:
             self._points = self._after
         self._state, self._damping = _with_points(given.state, self._points), given.damping
         lin = self._equations.linearized(self._state, given.damping)
+        self._told = lin.gain, lin.reduced.gradient, lin.diagonal
         self._split = self._split or _Split.of(lin.reduced, self._part.inner)
         return self._condensed(lin, self._split)
 
@@ -83,18 +97,20 @@ class PartEquations:
         except SingularMatrix as error:
             return Condensed(matrix, gradient[inner:], *rest, singular=error.unknown)
         self._inside = factor, across, gradient[:inner]
-        half = _half_solved(factor, np.concatenate([across, gradient[:inner, None]], axis=1))
+        half = factor.half_solved(np.concatenate([across, gradient[:inner, None]], axis=1))
         return Condensed(matrix - half[:, :-1].T @ half[:, :-1], gradient[inner:] - half[:, :-1].T @ half[:, -1], *rest)
 
-    def moved(self, shared: Array) -> tuple[Array, Array, Moved]:
-        """The part's own step (6 I,), its points, and what a step of the shared unknowns (6 J + B,) leads to."""
+    def moved(self, shared: Array) -> Led:
+        """Where a step of the shared unknowns (6 J + B,) leads."""
         own = np.zeros(0)
         if self._inside is not None:
             factor, across, gradient = self._inside
             own = -factor.solve(gradient + across @ shared)
-        moved = self._equations.moved(self._state, np.concatenate([own, shared]), self._damping)
+        step = np.concatenate([own, shared])
+        moved = self._equations.moved(self._state, step, self._damping)
         self._after = moved.state.points
-        return own, self._after, moved
+        promised = promised_decrease(*self._told, step, self._damping, moved)
+        return Led(own, self._after, moved.cost, promised, moved.hidden)
 
 
 def _with_points(state: State, points: Array) -> State:

@@ -154,13 +154,12 @@ class PartedBlock:
         step, points = np.zeros(self.layout.size), state.points.copy()
         step[(6 * self._separators[:, None] + np.arange(6)).ravel()] = shared[:edge]
         step[6 * self.layout.stations :] = shared[edge:]
-        for place, (own, moved, _) in zip(self._places, done, strict=True):
-            step[place.own], points[place.points] = own, moved
+        for place, led in zip(self._places, done, strict=True):
+            step[place.own], points[place.points] = led.own, led.points
         after = replace(moved_state(self.layout, state, step), points=points)
-        told = [moved for _, _, moved in done]
         self._after = after
-        cost, promised = sum(m.cost for m in told), sum(m.promised for m in told)
-        return step, Moved(after, cost, promised, sum(m.hidden for m in told)), promised
+        cost, promised = sum(led.cost for led in done), sum(led.promised for led in done)
+        return step, Moved(after, cost, sum(led.hidden for led in done), squares=0.0), promised
 
     def _shared_step(self, sums: Condensed, damping: float) -> Array:
         """Solves for separators and border, scaled to a unit diagonal before anything was eliminated."""

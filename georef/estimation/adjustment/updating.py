@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from georef.estimation.adjustment.adjust_block import (
+    _SETTLED_SHARE,
     AdjustedBlock,
     BlockOptions,
-    _SETTLED_SHARE,
     Quality,
     _scaled,
     adjust_block,
