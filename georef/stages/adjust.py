@@ -18,6 +18,8 @@ from georef.estimation.adjustment.checkpoints import Resumable
 from georef.estimation.adjustment.image_covariances import image_covariances
 from georef.estimation.adjustment.partitioned import Partitioned
 from georef.estimation.adjustment.solver import Solve, SolverOptions, solve_block
+from georef.estimation.adjustment.standing import Standing, with_lasting_names
+from georef.estimation.adjustment.updating import updated
 from georef.estimation.epoch_problem import epoch_problem, tie_pairs
 from georef.estimation.guided import Bearings, PosedFeatures
 from georef.estimation.tracks import PairMatches
@@ -27,9 +29,11 @@ from georef.io.items import read_item, write_item
 from georef.stages.adjustment_report import adjustment_data, adjustment_line, all_reliability, scene_points
 from georef.stages.adjustment_tables import write_tables
 from georef.stages.base import StageContext, StageSummary, feature_id, open_features
+from georef.stages.earlier import note_inputs
 from georef.stages.epoch_block import epoch_block
 from georef.stages.localize import make_task
 from georef.stages.solve_files import SolveFiles
+from georef.stages.standing_file import adjustment_inputs, standing_before, write_standing
 from georef.stages.stations import final_outcomes
 from georef.stages.tie_matches import TieImage, matched_pairs
 from georef.types.campaign import Image
@@ -100,16 +104,27 @@ def run(context: StageContext) -> StageSummary:
         ties, matched = matched_pairs(task, seen, pairs, context.folder.parent / TIES, context.executor)
     problem = epoch_problem(images, localized, posed, ties, task.map, context.survey.control, config.adjust)
     given, before = epoch_block(context, images, localized, problem)
+    given = with_lasting_names(given)
+    inputs = adjustment_inputs(context)
+    note_inputs(context.folder, inputs)
+    standing = standing_before(context, inputs)
     solves = SolveFiles(context.folder / SOLVES)
     with context.executor.held() as held:
         solve = solve_in(held, context.executor.workers, given)
-        adjusted = adjust_block(given, options_of(config.adjust), solve=Resumable(solves, solve))
+        resumable, options = Resumable(solves, solve), options_of(config.adjust)
+        if standing is None:
+            adjusted = adjust_block(given, options, solve=resumable)
+        else:
+            adjusted = updated(standing[0], given, options, resumable)
     checked = all_reliability(adjusted, context.survey.world)
-    data = adjustment_data(given, adjusted, checked) | before | {"pairs_matched": matched}
+    data = adjustment_data(given, adjusted, checked) | before | {"pairs_matched": matched, "updated_from": None}
+    if standing is not None:
+        data |= _still_wrong(standing[1])
     write_tables(context.folder, adjusted, checked, context.survey.world)
     marked = {mark.image_id for point in context.survey.check for mark in point.marks}
     arrays = _arrays(adjusted, marked, _colors(adjusted, posed))
     write_item(context.folder / RESULT, {"image_ids": list(given.image_ids), "data": data}, arrays)
+    write_standing(context.folder, Standing.of(given, adjusted))
     solves.clear()
     return StageSummary(adjustment_line(data), data, len(localized), len(localized))
 
@@ -125,6 +140,13 @@ def _placed_keypoints(
         rays = Bearings(np.zeros((0, 3)), np.zeros((0, 3, 2)))
         out.append(PosedFeatures(plain, image.camera, outcome.world_from_cam, rays))
     return out
+
+
+def _still_wrong(folder: Path) -> dict[str, Any]:
+    """What an update keeps of the adjustment that it began with: coherent blocks are not looked for again."""
+    before = read_adjusted(folder).data
+    kept = ("coherent_blocks", "undecidable")
+    return {"updated_from": folder.name, **{name: before[name] for name in kept if name in before}}
 
 
 def solve_in(held: Held, workers: int, block: Block) -> Solve:
