@@ -26,8 +26,8 @@ from georef.estimation.tracks import (
     select_points,
     triangulated_tracks,
 )
-from georef.executor import Progress
 from georef.features.base import Matcher
+from georef.geometry.camera import Camera
 from georef.geometry.projection import Views, linearize
 from georef.geometry.rigid import Array
 from georef.types.campaign import Image, PosePrior, PositionPrior
@@ -66,38 +66,29 @@ def _seen_by(images: Sequence[PosedFeatures], result: Localized) -> NDArray[np.i
     return overlap(result.points_in_world, directions, views, sizes)
 
 
-def match_new_images(
-    images: Sequence[PosedFeatures],
-    localized: Sequence[Localized],
-    pairs: Sequence[tuple[int, int]],
+def match_pair(
+    images: tuple[PosedFeatures, PosedFeatures],
+    pose_px: tuple[float, float],
     matcher: Matcher,
     keypoints: int,
     gate: float,
-    progress: Progress,
-) -> list[PairMatches]:
-    """Matches of pairs of new images, the strongest keypoints of each, near each other's epipolar lines.
+) -> NDArray[np.integer]:
+    """Matches (n, 2) of two new images, the strongest keypoints of each, near each other's epipolar lines.
 
-    `gate` is the largest distance, in keypoint scales combined with what the uncertainty of the poses amounts to.
+    `gate` is the largest distance, in keypoint scales combined with `pose_px`, what the uncertainty of the poses
+    amounts to in each. None are returned where they are too few to be trusted.
     """
-    pose_px = [_pose_sigma_px(image, result) for image, result in zip(images, localized, strict=True)]
-    out = []
-    progress.begin("tie points", len(pairs))
-    for i, j in pairs:
-        a, b = images[i], images[j]
-        found = matcher.match(a.features.head(keypoints), b.features.head(keypoints)).indices
-        scales = np.column_stack([a.features.scales_px[found[:, 0]], b.features.scales_px[found[:, 1]]])
-        allowed = gate * np.hypot(scales, np.hypot(pose_px[i], pose_px[j]))
-        found = found[(epipolar_distances(a, b, found) <= allowed).all(axis=1)]
-        if len(found) >= _LEAST_PAIR_MATCHES:
-            out.append(PairMatches(i, j, found))
-        progress.advance()
-    progress.end()
-    return out
+    a, b = images
+    found = matcher.match(a.features.head(keypoints), b.features.head(keypoints)).indices
+    scales = np.column_stack([a.features.scales_px[found[:, 0]], b.features.scales_px[found[:, 1]]])
+    allowed = gate * np.hypot(scales, np.hypot(*pose_px))
+    found = found[(epipolar_distances(a, b, found) <= allowed).all(axis=1)]
+    return found if len(found) >= _LEAST_PAIR_MATCHES else found[:0]
 
 
-def _pose_sigma_px(image: PosedFeatures, result: Localized) -> float:
+def pose_sigma_px(camera: Camera, result: Localized) -> float:
     """By how much the uncertainty of a pose moves the points that it rests on, in its image: 1-sigma, the median."""
-    views = Views.of([result.world_from_cam], [image.camera])
+    views = Views.of([result.world_from_cam], [camera])
     by_pose = linearize(views, np.zeros(len(result.points_in_world), np.int64), result.points_in_world).by_pose
     variance = np.einsum("nki,ij,nkj->n", by_pose, result.world_from_cam_cov, by_pose) / 2.0
     return float(np.sqrt(np.nanmedian(variance)))

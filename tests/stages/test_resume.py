@@ -35,6 +35,32 @@ project = open_project(Path(sys.argv[1]), output=Path(sys.argv[2]))
 list(run_pipeline(project, sys.argv[3], Executor()))
 """
 
+KILLED_WHILE_ADJUSTING = """
+import os, signal, sys
+from pathlib import Path
+from georef.executor import Executor
+from georef.pipeline import run_pipeline
+from georef.project import open_project
+from georef.stages import adjust, tie_matches
+
+class Killing(adjust.SolveFiles):
+    def write(self, key, reached):
+        super().write(key, reached)
+        if reached.solution.iterations == 2:
+            os.kill(os.getpid(), signal.SIGTERM)
+
+original, calls = tie_matches.match_pair, []
+def killed(*arguments):
+    calls.append(1)
+    if len(calls) == 2 and sys.argv[4] == "ties":
+        os.kill(os.getpid(), signal.SIGKILL)
+    return original(*arguments)
+tie_matches.match_pair, tie_matches._SHARD_PAIRS = killed, 1
+adjust.SolveFiles = Killing
+project = open_project(Path(sys.argv[1]), output=Path(sys.argv[2]))
+list(run_pipeline(project, sys.argv[3], Executor()))
+"""
+
 
 def stage_folder(bench: Bench, stage: str) -> Path:
     return bench.states()[stage].folder
@@ -68,6 +94,28 @@ def test_a_killed_run_goes_on_where_it_was(copied: Callable[..., Bench], finishe
     assert results["network"].reused
     assert (results["localize"].summary.computed, results["localize"].summary.total) == (2, 3)
     assert kept.items() <= items(bench).items()
+    assert bench.published("poses.csv") == finished.published("poses.csv")
+
+
+def test_an_adjustment_that_was_killed_goes_on_where_it_was(
+    copied: Callable[..., Bench], finished: Bench, caplog: pytest.LogCaptureFixture
+) -> None:
+    bench = copied()
+    pairs = bench.run()["adjust"].summary.data["pairs_matched"]
+    shutil.rmtree(stage_folder(bench, "adjust").parent)
+    for where, signalled in (("ties", signal.SIGKILL), ("solve", signal.SIGTERM)):
+        command = [sys.executable, "-c", KILLED_WHILE_ADJUSTING, str(bench.data), str(bench.output), EPOCH, where]
+        killed = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False, env=dict(os.environ))
+        assert killed.returncode == -signalled, killed.stderr
+        ties = len(list((stage_folder(bench, "adjust").parent / "ties").glob("*.npz")))
+        assert ties == (1 if where == "ties" else pairs)
+    assert len(list((stage_folder(bench, "adjust") / "solves").glob("*.npz"))) == 1
+    with caplog.at_level("INFO"):
+        result = bench.run()["adjust"].summary.data
+    assert result["pairs_matched"] == 0
+    assert "going on after iteration 2" in caplog.text
+    assert not (stage_folder(bench, "adjust") / "solves").exists()
+    assert bench.published("poses.csv") == finished.published("poses.csv")
     for name in ("localization.csv", "poses.csv"):
         assert bench.published(name) == finished.published(name)
 

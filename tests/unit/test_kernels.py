@@ -41,9 +41,9 @@ def _points() -> Array:
 
 @pytest.mark.parametrize("camera", _CAMERAS, ids=lambda c: c.camera_id)
 def test_lens_is_that_of_geometry(camera: Camera) -> None:
-    points, model = _points(), MODEL_NAMES.index(camera.model)
-    parameters, out = camera.parameters[None], np.zeros((len(points), 8))
-    shown = np.array([lens(model, parameters, 0, p[0], p[1], p[2], o) for p, o in zip(points, out, strict=True)])
+    points, model, parameters = _points(), MODEL_NAMES.index(camera.model), camera.parameters[None]
+    found = [lens(model, parameters, 0, *p) for p in points]
+    shown, out = np.array([row[0] for row in found]), np.array([row[1:] for row in found])
     image, by_point, _ = camera.lens.derivatives(points, camera.coefficients, np.asarray(camera.limit))
     assert np.array_equal(shown, np.isfinite(project(camera, points)).all(axis=1))
     assert 10 < shown.sum() < len(points)

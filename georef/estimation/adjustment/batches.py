@@ -65,6 +65,26 @@ class Shared(NamedTuple):
     mixed: Array  # (B, 3) W of these
 
 
+class Pairs(NamedTuple):
+    """Slots of all tracks, and where the pairs of stations of those that are eliminated stand in the pattern."""
+
+    slot: NDArray[np.int64]  # (T + 1,) first slot of each track
+    first: NDArray[np.int64]  # (T + 1,) first pair of each track
+    entry: NDArray[np.int32]  # (m,) of each pair of slots of a track, the second not before the first
+
+
+class Back(NamedTuple):
+    """What back-substitution needs of the elimination before it."""
+
+    square: Array  # (slots, 6) upper triangle of G'G, row by row
+    root: Array  # (T, 6) lower triangle of the inverse of the point's Cholesky factor, row by row
+    right: Array  # (T, 3) that inverse times the point's gradient
+
+    @staticmethod
+    def empty(slots: int, tracks: int) -> Back:
+        return Back(np.empty((slots, 6)), np.empty((tracks, 6)), np.empty((tracks, 3)))
+
+
 class Work(NamedTuple):
     """Scratch memory of one pass, made once."""
 

@@ -14,9 +14,10 @@ from scipy.linalg import get_blas_funcs, get_lapack_funcs
 
 from georef.estimation.adjustment.block import Indices
 from georef.estimation.adjustment.block_order import Front, fronts_of
+from georef.estimation.adjustment.kernels_fronts import assemble, extend
 from georef.geometry.rigid import Array
 
-(dtrsm,) = get_blas_funcs(("trsm",), dtype=np.float64)
+dsyrk, dtrsm = get_blas_funcs(("syrk", "trsm"), dtype=np.float64)
 dpotrf, dtrtri = get_lapack_funcs(("potrf", "trtri"), dtype=np.float64)
 
 VANISHING_PIVOT = 1e-12  # of its diagonal element before elimination: less is rounding
@@ -48,6 +49,18 @@ class Pattern:
     row: list[Indices]
     column: list[Indices]
     turned: list[Indices]
+
+    @property
+    def factor_work(self) -> float:
+        """Floating-point operations of a factor: two for each multiplication."""
+        sizes = ((6.0 * front.pivots, 6.0 * (len(front.members) - front.pivots)) for front in self.fronts)
+        return sum(p**3 / 3.0 + p * p * rest + p * rest * rest for p, rest in sizes)
+
+    @property
+    def solve_work(self) -> float:
+        """Floating-point operations of a solution with the factor."""
+        sizes = ((6.0 * front.pivots, 6.0 * (len(front.members) - front.pivots)) for front in self.fronts)
+        return sum(4.0 * p * (p + rest) for p, rest in sizes)
 
     @staticmethod
     def of(first: Indices, column: Indices) -> Pattern:
@@ -104,36 +117,47 @@ class BlockCholesky:
     @staticmethod
     def of(pattern: Pattern, blocks: Array) -> BlockCholesky:
         """blocks: (N, 6, 6) in the order of the pattern's matrix. Raises SingularMatrix."""
-        scale, blocks = _scaled(pattern, blocks)
-        corner: list[Array] = []
-        below: list[Array] = []
+        scale = _scale(pattern, blocks)
+        corners: list[Array] = []
+        belows: list[Array] = []
         waiting: dict[int, list[tuple[Indices, Array]]] = {}
         for index, front in enumerate(pattern.fronts):
-            matrix = _assembled(pattern, index, blocks)
-            for place, update in waiting.pop(index, []):
-                matrix[np.ix_(place, place)] += update
-            pivots = 6 * front.pivots
-            factor, failed = dpotrf(matrix[:pivots, :pivots], lower=1, clean=1)
-            low = np.flatnonzero(np.square(np.diag(factor)) < VANISHING_PIVOT)
+            corner, below, update = _assembled(pattern, index, blocks, scale, waiting.pop(index, []))
+            corner, failed = dpotrf(corner, lower=1, clean=1, overwrite_a=1)
+            low = np.flatnonzero(np.square(np.diag(corner)) < VANISHING_PIVOT)
             if failed or len(low):
                 where = failed - 1 if failed else low[0]
                 raise SingularMatrix(int(pattern.unknowns[index][where]))
-            rest = np.asarray(dtrsm(1.0, factor, matrix[pivots:, :pivots], side=1, lower=1, trans_a=1))
-            if front.parent >= 0:
-                update = matrix[pivots:, pivots:] - rest @ rest.T
+            if len(below):
+                below = dtrsm(1.0, corner, below, side=1, lower=1, trans_a=1, overwrite_b=1)
+                update = dsyrk(-1.0, below, beta=1.0, c=update, lower=1, overwrite_c=1)
                 waiting.setdefault(front.parent, []).append((pattern.passed[index], update))
-            corner.append(factor)
-            below.append(rest)
-        return BlockCholesky(pattern, scale, corner, below)
+            corners.append(corner)
+            belows.append(below)
+        return BlockCholesky(pattern, scale.ravel(), corners, belows)
 
     def solve(self, right: Array) -> Array:
         """A^-1 times vectors (6 S,) or (6 S, m)."""
+        return self.back_solved(self.half_solved(right))
+
+    def half_solved(self, right: Array) -> Array:
+        """L^-1 S times vectors (6 S,) or (6 S, m); columns may be zero at most stations (a drift)."""
         flat = right.ndim == 1
         x = np.asfortranarray((right[:, None] if flat else right) * self.scale[:, None])
         for own, rest, corner, below in self._parts():
-            x[own] = dtrsm(1.0, corner, x[own], lower=1)
+            columns = np.array([0]) if flat else np.flatnonzero(x[own].any(axis=0))
+            if not len(columns):
+                continue
+            at = np.ix_(own, columns)
+            x[at] = solved = dtrsm(1.0, corner, x[at], lower=1)
             if len(rest):
-                x[rest] -= below @ x[own]
+                x[np.ix_(rest, columns)] -= below @ solved
+        return x[:, 0] if flat else x
+
+    def back_solved(self, half: Array) -> Array:
+        """S L'^-1 times vectors (6 S,) or (6 S, m)."""
+        flat = half.ndim == 1
+        x = np.array(half[:, None] if flat else half, order="F")
         for own, rest, corner, below in reversed(list(self._parts())):
             known = x[own] - below.T @ x[rest] if len(rest) else x[own]
             x[own] = dtrsm(1.0, corner, known, lower=1, trans_a=1)
@@ -173,14 +197,18 @@ class BlockCholesky:
             yield unknowns[: 6 * front.pivots], unknowns[6 * front.pivots :], corner, below
 
 
-def _assembled(pattern: Pattern, index: int, blocks: Array) -> Array:
-    """The front's own part of the matrix, lower triangle of blocks (diagonal ones whole)."""
-    count = len(pattern.fronts[index].members)
-    matrix = np.zeros((count, 6, count, 6))
-    taken, turned = blocks[pattern.entries[index]], pattern.turned[index].astype(bool)
-    taken[turned] = np.swapaxes(taken[turned], 1, 2)
-    matrix[pattern.row[index], :, pattern.column[index], :] = taken
-    return matrix.reshape(6 * count, 6 * count)
+def _assembled(
+    pattern: Pattern, index: int, blocks: Array, scale: Array, updates: list[tuple[Indices, Array]]
+) -> tuple[Array, Array, Array]:
+    """A front before its pivots are eliminated, see `kernels_fronts`: its own blocks, and what its children pass on."""
+    pivots = 6 * pattern.fronts[index].pivots
+    rest = len(pattern.unknowns[index]) - pivots
+    corner, below, update = (np.zeros(shape, order="F") for shape in ((pivots, pivots), (rest, pivots), (rest, rest)))
+    own = (pattern.entries[index], pattern.row[index], pattern.column[index], pattern.turned[index])
+    assemble(blocks, scale, pattern.block_row, pattern.block_column, *own, corner, below, update)
+    for place, passed in updates:
+        extend(place, passed, corner, below, update)
+    return corner, below, update
 
 
 def _taken(pattern: Pattern, index: int, inverse: Array, out: Array) -> None:
@@ -192,16 +220,15 @@ def _taken(pattern: Pattern, index: int, inverse: Array, out: Array) -> None:
     out[pattern.entries[index]] = found
 
 
-def _scaled(pattern: Pattern, blocks: Array) -> tuple[Array, Array]:
-    """The scale that makes the diagonal one, and the scaled blocks: radians and metres differ by much."""
+def _scale(pattern: Pattern, blocks: Array) -> Array:
+    """The scale (S, 6) that makes the diagonal one: radians and metres differ by much."""
     diagonal = np.zeros((pattern.stations, 6))
     own = pattern.block_row == pattern.block_column
     diagonal[pattern.block_row[own]] = np.diagonal(blocks[own], axis1=1, axis2=2)
     bad = np.flatnonzero(~(diagonal.ravel() > 0))
     if len(bad):
         raise SingularMatrix(int(bad[0]))
-    scale = 1.0 / np.sqrt(diagonal)
-    return scale.ravel(), _scaled_by(pattern, scale, blocks)
+    return 1.0 / np.sqrt(diagonal)
 
 
 def _scaled_by(pattern: Pattern, scale: Array, blocks: Array) -> Array:

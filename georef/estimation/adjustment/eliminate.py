@@ -9,7 +9,7 @@ from typing import cast
 import numpy as np
 from numpy.typing import NDArray
 
-from georef.estimation.adjustment.batches import Work
+from georef.estimation.adjustment.batches import Back, Work
 from georef.estimation.adjustment.block import KINDS_OF_POINT, Block, Indices, State
 from georef.estimation.adjustment.constraint_terms import Term, constraint_terms, root
 from georef.estimation.adjustment.kernels_eliminate import Sums, eliminate_points
@@ -30,7 +30,8 @@ class Linearized:
 
     diagonal: of the normal matrix of stations and border before elimination, which damping goes by. cost: half the sum
     of squared whitened residuals, losses applied. hidden: image observations whose point the lens does not show, which
-    take no part. undetermined: points that their rays leave free in some direction; held there.
+    take no part. undetermined: points that their rays leave free in some direction; held there. gain: by how much the
+    cost of the linear model, damping of points included, falls if stations and border stay and points alone move.
     """
 
     reduced: Reduced
@@ -38,6 +39,7 @@ class Linearized:
     cost: float
     hidden: int
     undetermined: int
+    gain: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,16 +67,18 @@ def normal_equations(
     damping: float = 0.0,
     prepared: Prepared | None = None,
     work: Work | None = None,
+    back: Back | None = None,
 ) -> Linearized:
     """Linearises a block at a state. damping is relative to the diagonal, of points only: that of the reduced system is
-    left to the caller. prepared and work, made once for a block, save time."""
+    left to the caller. prepared and work, made once for a block, save time; back is filled for `move_points`."""
     losses, prepared = losses or {}, prepared or Prepared.of(block)
     layout = prepared.layout
     sums = _empty_sums(prepared)
     given = GivenPoints.at(block, state.points, losses)
-    cost, hidden, undetermined = eliminate_points(
+    cost, hidden, undetermined, gain = eliminate_points(
         *(prepared.tracks, prepared.images, placed(state), state.points, given.information, given.shift),
-        *(damping, losses.get(IMAGE_OBSERVATIONS, 0.0), sums, work or prepared.work()),
+        *(damping, losses.get(IMAGE_OBSERVATIONS, 0.0), prepared.pairs, sums),
+        *(back or Back.empty(0, 0), work or prepared.work()),
     )
     cost += cost_of_squares(given.square, _point_scales(block, losses))
     for term in [*constraint_terms(block, state, layout), *_kept_priors(block, state, layout)]:
@@ -82,11 +86,11 @@ def normal_equations(
         scale = term_scales(block, term, losses)
         cost += 0.0 if term.name in KINDS_OF_POINT else cost_of_squares(square, scale)
         _add(weighted(term, robust_weight(square, scale)), layout, sums)
-    sums.block[:] = _symmetric_diagonals(sums)
+    sums.block[:] = _whole_diagonals(sums)
     corner = sums.corner + sums.corner.T - np.diag(np.diag(sums.corner))
     border = sums.border.reshape(6 * layout.stations, layout.border)
     reduced = Reduced(layout, prepared.first, prepared.column, sums.block, border, corner, sums.gradient)
-    return Linearized(reduced, sums.diagonal, float(cost), int(hidden), int(undetermined))
+    return Linearized(reduced, sums.diagonal, float(cost), int(hidden), int(undetermined), float(gain))
 
 
 def total_cost(
@@ -111,27 +115,6 @@ def constraint_cost(block: Block, state: State, layout: Layout, losses: Losses) 
     for term in constraint_terms(block, state, layout):
         cost += cost_of_squares(np.sum(np.square(term.residual), axis=1), term_scales(block, term, losses))
     return cost
-
-
-def promised_by_constraints(
-    block: Block, state: State, step: Array, moved: Array, layout: Layout, losses: Losses
-) -> float:
-    """Decrease of the cost of constraints that their linear model promises for a step (6 S + B,), points moved to
-    (P, 3)."""
-    before, after = 0.0, 0.0
-    for term in constraint_terms(block, state, layout):
-        square = np.sum(np.square(term.residual), axis=1)
-        weight = robust_weight(square, term_scales(block, term, losses))
-        predicted = term.residual.copy()
-        for first, by in term.columns:
-            rows = first >= 0
-            change = step[first[rows][:, None] + np.arange(by.shape[2])]
-            predicted[rows] += np.einsum("kij,kj->ki", by[rows], change)
-        before += 0.5 * float(weight @ square)
-        after += 0.5 * float(weight @ np.sum(np.square(predicted), axis=1))
-    square = given_squares(block, state.points)
-    weight = robust_weight(square, _point_scales(block, losses))
-    return before - after + 0.5 * float(weight @ (square - given_squares(block, moved)))
 
 
 def given_squares(block: Block, points: Array) -> Array:
@@ -193,10 +176,11 @@ def _kept_priors(block: Block, state: State, layout: Layout) -> list[Term]:
     return [Term(KINDS_OF_POINT[0], residual, ((6 * layout.stations + first[row], weight),), row)]
 
 
-def _symmetric_diagonals(sums: Sums) -> Array:
-    """All blocks, the diagonal ones freed of what rounding leaves unsymmetric."""
+def _whole_diagonals(sums: Sums) -> Array:
+    """All blocks, the diagonal ones, of which only upper triangles are summed, made whole."""
     own = sums.first[:-1]
-    sums.block[own] = 0.5 * (sums.block[own] + np.swapaxes(sums.block[own], 1, 2))
+    upper = np.triu(sums.block[own])
+    sums.block[own] = upper + np.swapaxes(np.triu(upper, 1), 1, 2)
     return sums.block
 
 

@@ -10,18 +10,16 @@ from typing import Protocol
 
 import numpy as np
 
-from georef.estimation.adjustment.batches import Work
+from georef.estimation.adjustment.batches import Back, Work
 from georef.estimation.adjustment.block import Block, Indices, State
 from georef.estimation.adjustment.block_cholesky import Pattern
 from georef.estimation.adjustment.eliminate import (
     IMAGE_OBSERVATIONS,
-    GivenPoints,
     Linearized,
     Losses,
     constraint_cost,
     cost_of_squares,
     normal_equations,
-    promised_by_constraints,
 )
 from georef.estimation.adjustment.kernels_move import move_points
 from georef.estimation.adjustment.prepared import Prepared, placed
@@ -35,13 +33,13 @@ HIDDEN_SQUARE = 1e4
 @dataclass(frozen=True, eq=False)
 class Moved:
     """Where a step leads: the state, its cost as in `Linearized` with HIDDEN_SQUARE for the squared residual of each
-    image observation that no lens shows, the decrease of the cost that the linear model promised, and how many are out
-    of sight."""
+    image observation that no lens shows, how many are out of sight, and the sum of the squared steps of eliminated
+    points, each times the diagonal of the point's normal matrix (0 will do without damping)."""
 
     state: State
     cost: float
-    promised: float
     hidden: int
+    squares: float
 
 
 class Equations(Protocol):
@@ -77,6 +75,7 @@ class BlockEquations:
     def __init__(self, block: Block, losses: Losses | None = None, prepared: Prepared | None = None) -> None:
         self._block, self._losses, self._prepared = block, losses or {}, prepared or Prepared.of(block)
         self._work: Work = self._prepared.work()
+        self._back: Back = self._prepared.back()
         self._image_scale = self._losses.get(IMAGE_OBSERVATIONS, 0.0)
 
     @property
@@ -93,21 +92,23 @@ class BlockEquations:
 
     def linearized(self, state: State, damping: float) -> Linearized:
         return normal_equations(
-            *(self._block, state), losses=self._losses, damping=damping, prepared=self._prepared, work=self._work
+            *(self._block, state),
+            losses=self._losses,
+            damping=damping,
+            prepared=self._prepared,
+            work=self._work,
+            back=self._back,
         )
 
     def moved(self, state: State, step: Array, damping: float) -> Moved:
         after = moved_state(self.layout, state, step)
-        given = GivenPoints.at(self._block, state.points, self._losses)
-        promised, cost, hidden = move_points(
-            *(self._prepared.tracks, self._prepared.images, placed(state), placed(after), state.points),
-            *(given.information, given.shift, damping, self._image_scale, HIDDEN_SQUARE, step, after.points),
-            self._work,
+        prepared = self._prepared
+        cost, hidden, squares = move_points(
+            *(prepared.tracks, prepared.images, prepared.pairs, placed(state), placed(after), state.points, damping),
+            *(self._image_scale, HIDDEN_SQUARE, step, self._back, after.points),
         )
-        args = (self.layout, self._losses)
-        cost += constraint_cost(self._block, after, *args)
-        promised += promised_by_constraints(self._block, state, step, after.points, *args)
-        return Moved(after, float(cost), float(promised), int(hidden))
+        cost += constraint_cost(self._block, after, self.layout, self._losses)
+        return Moved(after, float(cost), int(hidden), float(squares))
 
 
 def moved_state(layout: Layout, state: State, step: Array) -> State:

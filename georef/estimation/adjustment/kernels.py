@@ -51,30 +51,28 @@ class Placed(NamedTuple):
 
 
 @kernel
-def lens(model, parameters, row, x, y, z, out):
-    """Image coordinates at unit focal length in out[:2], their derivatives by the point, row by row, in out[2:8]; False
-    where the lens shows nothing. parameters (C, ...), of which the row is meant."""
+def lens(model, parameters, row, x, y, z):
+    """Whether a lens shows a point, its image coordinates at unit focal length, and their derivatives by the point (3
+    of the first, 3 of the second). parameters (C, ...), of which the row is meant."""
     limit = parameters[row, parameters.shape[1] - 1]
     if model == FISHEYE:
-        return _fisheye(parameters, row, limit, x, y, z, out)
+        return _fisheye(parameters, row, limit, x, y, z)
     if not z > 0.0:
-        return False
+        return False, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     inverse = 1.0 / z
     a, b = x * inverse, y * inverse
-    out[0], out[1] = a, b
-    xx, xy, yy = 1.0, 0.0, 1.0
+    u, v, xx, xy, yy = a, b, 1.0, 0.0, 1.0
     if model != PINHOLE:
         if not a * a + b * b <= limit * limit:
-            return False
-        xx, xy, yy = _bend(model, parameters, row, a, b, out)
-    out[2], out[3], out[4] = xx * inverse, xy * inverse, -(xx * a + xy * b) * inverse
-    out[5], out[6], out[7] = xy * inverse, yy * inverse, -(xy * a + yy * b) * inverse
-    return True
+            return False, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+        u, v, xx, xy, yy = _bend(model, parameters, row, a, b)
+    xz, yz = -(xx * a + xy * b) * inverse, -(xy * a + yy * b) * inverse
+    return True, u, v, xx * inverse, xy * inverse, xz, xy * inverse, yy * inverse, yz
 
 
 @kernel
-def _bend(model, k, row, x, y, out):
-    """Distorts slopes by Brown's or the rational model into out[:2]; the symmetric derivative xx, xy, yy."""
+def _bend(model, k, row, x, y):
+    """Slopes distorted by Brown's or the rational model, and the symmetric derivative xx, xy, yy."""
     k1, k2, p1, p2, k3 = k[row, 4], k[row, 5], k[row, 6], k[row, 7], k[row, 8]
     r2 = x * x + y * y
     radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
@@ -85,9 +83,9 @@ def _bend(model, k, row, x, y, out):
         radial /= below
         rate = (rate - radial * (k4 + r2 * (2.0 * k5 + 3.0 * r2 * k6))) / below
     rate *= 2.0
-    out[0] = x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x)
-    out[1] = y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y
     return (
+        x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x),
+        y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y,
         radial + rate * x * x + 2.0 * p1 * y + 6.0 * p2 * x,
         rate * x * y + 2.0 * p1 * x + 2.0 * p2 * y,
         radial + rate * y * y + 6.0 * p1 * y + 2.0 * p2 * x,
@@ -95,26 +93,26 @@ def _bend(model, k, row, x, y, out):
 
 
 @kernel
-def _fisheye(k, row, limit, x, y, z, out):
+def _fisheye(k, row, limit, x, y, z):
     across = sqrt(x * x + y * y)
     angle = atan2(across, z)
     if not (angle <= limit and (across > 0.0 or z > 0.0)):
-        return False
+        return False, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     k1, k2, k3, k4 = k[row, 4], k[row, 5], k[row, 6], k[row, 7]
     t2 = angle * angle
     radius = angle * (1.0 + t2 * (k1 + t2 * (k2 + t2 * (k3 + t2 * k4))))
     rate = 1.0 + t2 * (3.0 * k1 + t2 * (5.0 * k2 + t2 * (7.0 * k3 + t2 * 9.0 * k4)))
-    squared = across * across + z * z
+    inverse = 1.0 / (across * across + z * z)
     if across <= _ON_AXIS * abs(z):
         ex, ey, sideways = 1.0, 0.0, 1.0 / z
-        out[0], out[1] = x / z, y / z
+        u, v = x * sideways, y * sideways
     else:
-        ex, ey, sideways = x / across, y / across, radius / across
-        out[0], out[1] = radius * ex, radius * ey
-    turn, back = rate * z / squared - sideways, -rate * across / squared
-    out[2], out[3], out[4] = sideways + turn * ex * ex, turn * ex * ey, back * ex
-    out[5], out[6], out[7] = turn * ex * ey, sideways + turn * ey * ey, back * ey
-    return True
+        unit = 1.0 / across
+        ex, ey, sideways = x * unit, y * unit, radius * unit
+        u, v = radius * ex, radius * ey
+    turn, back = rate * z * inverse - sideways, -rate * across * inverse
+    mixed = turn * ex * ey
+    return True, u, v, sideways + turn * ex * ex, mixed, back * ex, mixed, sideways + turn * ey * ey, back * ey
 
 
 @kernel

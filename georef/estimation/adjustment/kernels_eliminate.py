@@ -26,13 +26,14 @@ class Sums(NamedTuple):
 
 
 @kernel
-def eliminate_points(tracks, images, placed, points, information, shift, damping, cauchy, sums, work):
-    """Adds all image observations, their points eliminated; cost, observations no lens shows, undetermined points.
+def eliminate_points(tracks, images, placed, points, information, shift, damping, cauchy, pairs, sums, back, work):
+    """Adds all image observations, their points eliminated; cost, observations no lens shows, undetermined points, and
+    by how much the (damped) cost falls if points alone move.
 
     points (P, 3); information (K, 3, 3) and its products with given positions (K, 3) of point priors; damping is
-    relative to the diagonal of points.
+    relative to the diagonal of points. back: filled, unless it is empty.
     """
-    cost, hidden, undetermined = 0.0, 0, 0
+    cost, hidden, undetermined, gain = 0.0, 0, 0, 0.0
     rays, slots, shared = work.rays, work.slots, work.shared
     border = sums.corner.shape[0] > 0
     for begin in range(0, tracks.point.shape[0], BATCH):
@@ -43,56 +44,92 @@ def eliminate_points(tracks, images, placed, points, information, shift, damping
         sum_stations(count, slots.first[end - begin], rays, slots)
         undetermined += point_normals(tracks, begin, end, placed, points, information, shift, damping, slots)
         _add_stations(slots.first[end - begin], slots, sums)
-        _roots_of_stations(tracks, begin, end, slots, sums)
-        _subtract_stations(tracks, begin, end, slots, sums)
+        gain += _roots_of_stations(tracks, begin, end, slots, sums)
+        _subtract_stations(tracks, begin, end, pairs, slots, sums)
+        if back.right.shape[0] > 0:
+            _leave(tracks, begin, end, pairs.slot[begin], slots, back)
         if border:
             share(tracks, begin, end, images, placed, rays)
             keep(tracks, begin, end, placed, rays, slots)
             _add_shared(count, rays, slots, sums)
             _subtract_shared(tracks, begin, end, placed, rays, slots, shared, sums)
-    return cost, hidden, undetermined
+    return cost, hidden, undetermined, gain
+
+
+@kernel
+def _leave(tracks, begin, end, slot, slots, back):
+    """Keeps what back-substitution needs; slot: number of the batch's first one."""
+    for s in range(slots.first[end - begin]):
+        square = slots.square
+        back.square[slot + s, 0], back.square[slot + s, 1] = square[s, 0, 0], square[s, 0, 1]
+        back.square[slot + s, 2], back.square[slot + s, 3] = square[s, 0, 2], square[s, 1, 1]
+        back.square[slot + s, 4], back.square[slot + s, 5] = square[s, 1, 2], square[s, 2, 2]
+    for p in range(end - begin):
+        if tracks.kept[begin + p] >= 0:
+            continue
+        root = slots.root
+        back.root[begin + p, 0], back.root[begin + p, 1] = root[p, 0, 0], root[p, 1, 0]
+        back.root[begin + p, 2], back.root[begin + p, 3] = root[p, 1, 1], root[p, 2, 0]
+        back.root[begin + p, 4], back.root[begin + p, 5] = root[p, 2, 1], root[p, 2, 2]
+        for i in range(3):
+            back.right[begin + p, i] = slots.right[p, i]
 
 
 @kernel
 def _add_stations(count, slots, sums):
-    """The stations' own normal matrices T'MT and gradients T'g, T = [[q]x, -I], of all slots."""
-    f = np.empty((6, 3))
+    """The stations' own normal matrices T'MT (upper triangles) and gradients T'g, T = [[q]x, -I], of all slots."""
     block, gradient, diagonal = sums.block, sums.gradient, sums.diagonal
     for s in range(count):
         station = slots.station[s]
         own, at = sums.first[station], 6 * station
         x, y, z = slots.q[s, 0], slots.q[s, 1], slots.q[s, 2]
-        for j in range(3):  # T'M
-            m0, m1, m2 = slots.square[s, 0, j], slots.square[s, 1, j], slots.square[s, 2, j]
-            f[0, j], f[1, j], f[2, j] = z * m1 - y * m2, x * m2 - z * m0, y * m0 - x * m1
-            f[3, j], f[4, j], f[5, j] = -m0, -m1, -m2
-        for i in range(6):
-            a, b, c = f[i, 0], f[i, 1], f[i, 2]
-            block[own, i, 0] += b * z - c * y
-            block[own, i, 1] += c * x - a * z
-            block[own, i, 2] += a * y - b * x
-            block[own, i, 3] -= a
-            block[own, i, 4] -= b
-            block[own, i, 5] -= c
-        g0, g1, g2 = slots.slope[s, 0], slots.slope[s, 1], slots.slope[s, 2]
-        gradient[at] += z * g1 - y * g2
-        gradient[at + 1] += x * g2 - z * g0
-        gradient[at + 2] += y * g0 - x * g1
-        gradient[at + 3] -= g0
-        gradient[at + 4] -= g1
-        gradient[at + 5] -= g2
-        diagonal[at] += f[0, 1] * z - f[0, 2] * y
-        diagonal[at + 1] += f[1, 2] * x - f[1, 0] * z
-        diagonal[at + 2] += f[2, 0] * y - f[2, 1] * x
-        for i in range(3):
-            diagonal[at + 3 + i] -= f[3 + i, i]
+        a, b, c = slots.square[s, 0, 0], slots.square[s, 0, 1], slots.square[s, 0, 2]
+        d, e, f = slots.square[s, 1, 1], slots.square[s, 1, 2], slots.square[s, 2, 2]
+        u, v, w = slots.slope[s, 0], slots.slope[s, 1], slots.slope[s, 2]
+        m00, m01, m02 = z * b - y * c, z * d - y * e, z * e - y * f  # [q]x' M
+        m10, m11, m12 = x * c - z * a, x * e - z * b, x * f - z * c
+        m20, m21, m22 = y * a - x * b, y * b - x * d, y * c - x * e
+        d0, d1, d2 = m01 * z - m02 * y, m12 * x - m10 * z, m20 * y - m21 * x
+        block[own, 0, 0] += d0
+        block[own, 0, 1] += m02 * x - m00 * z
+        block[own, 0, 2] += m00 * y - m01 * x
+        block[own, 0, 3] -= m00
+        block[own, 0, 4] -= m01
+        block[own, 0, 5] -= m02
+        block[own, 1, 1] += d1
+        block[own, 1, 2] += m10 * y - m11 * x
+        block[own, 1, 3] -= m10
+        block[own, 1, 4] -= m11
+        block[own, 1, 5] -= m12
+        block[own, 2, 2] += d2
+        block[own, 2, 3] -= m20
+        block[own, 2, 4] -= m21
+        block[own, 2, 5] -= m22
+        block[own, 3, 3] += a
+        block[own, 3, 4] += b
+        block[own, 3, 5] += c
+        block[own, 4, 4] += d
+        block[own, 4, 5] += e
+        block[own, 5, 5] += f
+        gradient[at] += z * v - y * w
+        gradient[at + 1] += x * w - z * u
+        gradient[at + 2] += y * u - x * v
+        gradient[at + 3] -= u
+        gradient[at + 4] -= v
+        gradient[at + 5] -= w
+        diagonal[at] += d0
+        diagonal[at + 1] += d1
+        diagonal[at + 2] += d2
+        diagonal[at + 3] += a
+        diagonal[at + 4] += d
+        diagonal[at + 5] += f
 
 
 @kernel
 def _roots_of_stations(tracks, begin, end, slots, sums):
     """E of all slots, with W N^-1 W' = E'E; what elimination takes off the gradients. Leaves L^-1 times the points'
-    gradients in `right`."""
-    e, gradient = slots.eliminated, sums.gradient
+    gradients in `right`; half the sum of their squares."""
+    e, gradient, gain = slots.eliminated, sums.gradient, 0.0
     for p in range(end - begin):
         if tracks.kept[begin + p] >= 0:
             continue
@@ -101,34 +138,46 @@ def _roots_of_stations(tracks, begin, end, slots, sums):
         g0, g1, g2 = slots.right[p, 0], slots.right[p, 1], slots.right[p, 2]
         h0, h1, h2 = r00 * g0, r10 * g0 + r11 * g1, r20 * g0 + r21 * g1 + r22 * g2
         slots.right[p, 0], slots.right[p, 1], slots.right[p, 2] = h0, h1, h2
+        gain += h0 * h0 + h1 * h1 + h2 * h2
         for s in range(slots.first[p], slots.first[p + 1]):
+            m, at = slots.mixed, 6 * slots.station[s]
             x, y, z = slots.q[s, 0], slots.q[s, 1], slots.q[s, 2]
+            m00, m01, m02 = m[s, 0, 0], m[s, 0, 1], m[s, 0, 2]
+            m10, m11, m12 = m[s, 1, 0], m[s, 1, 1], m[s, 1, 2]
+            m20, m21, m22 = m[s, 2, 0], m[s, 2, 1], m[s, 2, 2]
             for i in range(3):
-                a, b, c = slots.mixed[s, i, 0], slots.mixed[s, i, 1], slots.mixed[s, i, 2]
-                e[s, 0, 3 + i] = -r00 * a
-                e[s, 1, 3 + i] = -(r10 * a + r11 * b)
-                e[s, 2, 3 + i] = -(r20 * a + r21 * b + r22 * c)
-            for j in range(3):
-                a, b, c = e[s, j, 3], e[s, j, 4], e[s, j, 5]
-                e[s, j, 0], e[s, j, 1], e[s, j, 2] = y * c - z * b, z * a - x * c, x * b - y * a
-            at = 6 * slots.station[s]
-            for i in range(6):
-                gradient[at + i] -= e[s, 0, i] * h0 + e[s, 1, i] * h1 + e[s, 2, i] * h2
+                if i == 0:
+                    a, b, c, h = -r00 * m00, -r00 * m10, -r00 * m20, h0
+                elif i == 1:
+                    a, b, c, h = -(r10 * m00 + r11 * m01), -(r10 * m10 + r11 * m11), -(r10 * m20 + r11 * m21), h1
+                else:
+                    a = -(r20 * m00 + r21 * m01 + r22 * m02)
+                    b = -(r20 * m10 + r21 * m11 + r22 * m12)
+                    c = -(r20 * m20 + r21 * m21 + r22 * m22)
+                    h = h2
+                k, n, o = y * c - z * b, z * a - x * c, x * b - y * a
+                e[s, i, 0], e[s, i, 1], e[s, i, 2], e[s, i, 3], e[s, i, 4], e[s, i, 5] = k, n, o, a, b, c
+                gradient[at] -= k * h
+                gradient[at + 1] -= n * h
+                gradient[at + 2] -= o * h
+                gradient[at + 3] -= a * h
+                gradient[at + 4] -= b * h
+                gradient[at + 5] -= c * h
+    return 0.5 * gain
 
 
 @kernel
-def _subtract_stations(tracks, begin, end, slots, sums):
+def _subtract_stations(tracks, begin, end, pairs, slots, sums):
     """W N^-1 W' of all pairs of a point's stations."""
-    e, block, first, column = slots.eliminated, sums.block, sums.first, sums.column
+    e, block = slots.eliminated, sums.block
     for p in range(end - begin):
         if tracks.kept[begin + p] >= 0:
             continue
+        pair = pairs.first[begin + p]
         for s in range(slots.first[p], slots.first[p + 1]):
-            entry = first[slots.station[s]]
             for other in range(s, slots.first[p + 1]):
-                there = slots.station[other]
-                while column[entry] != there:
-                    entry += 1
+                entry = pairs.entry[pair]
+                pair += 1
                 for i in range(6):
                     a, b, c = e[s, 0, i], e[s, 1, i], e[s, 2, i]
                     for j in range(6):

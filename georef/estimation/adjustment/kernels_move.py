@@ -2,114 +2,80 @@
 
 from __future__ import annotations
 
-import numpy as np
-
 from georef.estimation.adjustment.batches import BATCH
 from georef.estimation.adjustment.kernels import kernel, lens
-from georef.estimation.adjustment.kernels_points import (
-    keep,
-    linearize,
-    loss,
-    point_normals,
-    share,
-    sum_stations,
-)
+from georef.estimation.adjustment.kernels_points import loss
 
 
 @kernel
-def move_points(
-    tracks, images, placed, moved, points, information, shift, damping, cauchy, hidden_square, step, moved_points, work
-):
-    """Fills moved_points (P, 3) by back-substitution of step (6 S + B,), which leads from `placed` to `moved`.
+def move_points(tracks, images, pairs, placed, moved, points, damping, cauchy, hidden_square, step, back, moved_points):
+    """Fills moved_points (P, 3) by back-substitution of step (6 S + B,), which leads from `placed` to `moved`; `back`
+    is of the elimination at `placed` with this damping.
 
-    The decrease of the cost that the linear model of the image observations promises, their cost after the step with
-    hidden_square for the squared residual of one that no lens shows, and how many those are.
+    The cost of the image observations after the step with hidden_square for the squared residual of one that no lens
+    shows, how many those are, and the sum of the squared steps of points times the diagonal of their normal matrices.
     """
-    promised, cost, hidden = 0.0, 0.0, 0
-    rays, slots = work.rays, work.slots
-    border = step.shape[0] > 6 * placed.rig_rotation.shape[0]
+    cost, hidden, squares = 0.0, 0, 0.0
     for begin in range(0, tracks.point.shape[0], BATCH):
         end = min(begin + BATCH, tracks.point.shape[0])
-        linearize(tracks, begin, end, images, placed, points, cauchy, rays, slots)
-        if border:
-            share(tracks, begin, end, images, placed, rays)
-            keep(tracks, begin, end, placed, rays, slots)
-        count = tracks.start[end] - tracks.start[begin]
-        promised += _squares(count, rays)
-        _predict(count, 6 * placed.rig_rotation.shape[0], step, rays, slots)
-        sum_stations(count, slots.first[end - begin], rays, slots)
-        point_normals(tracks, begin, end, placed, points, information, shift, damping, slots)
-        _move(tracks, begin, end, 6 * placed.rig_rotation.shape[0], step, points, moved_points, slots)
-        _predict_by_points(tracks, begin, end, placed.rig_rotation, rays, slots)
-        promised -= _squares(count, rays)
+        squares += _move(tracks, begin, end, images, pairs.slot, placed, points, damping, step, back, moved_points)
         more, unseen = _cost(tracks, begin, end, images, moved, moved_points, cauchy, hidden_square)
         cost, hidden = cost + more, hidden + unseen
-    return promised, cost, hidden
+    return cost, hidden, squares
 
 
 @kernel
-def _squares(count, rays):
-    """Half the squared residuals of a batch."""
-    total = 0.0
-    for o in range(count):
-        if rays.slot[o] >= 0:
-            total += rays.residual[o, 0] ** 2 + rays.residual[o, 1] ** 2
-    return 0.5 * total
-
-
-@kernel
-def _predict(count, unknown, step, rays, slots):
-    """Adds to the residuals what the step of stations and border changes."""
-    for o in range(count):
-        s = rays.slot[o]
-        if s < 0:
-            continue
-        at, q = 6 * slots.station[s], slots.q
-        x = q[s, 1] * step[at + 2] - q[s, 2] * step[at + 1] - step[at + 3]
-        y = q[s, 2] * step[at] - q[s, 0] * step[at + 2] - step[at + 4]
-        z = q[s, 0] * step[at + 1] - q[s, 1] * step[at] - step[at + 5]
-        for i in range(2):
-            change = rays.by_rig[o, i, 0] * x + rays.by_rig[o, i, 1] * y + rays.by_rig[o, i, 2] * z
-            for a in range(rays.columns[o]):
-                change += rays.shared[o, i, a] * step[unknown + rays.column[o, a]]
-            rays.residual[o, i] += change
-
-
-@kernel
-def _move(tracks, begin, end, unknown, step, points, moved_points, slots):
-    """Points of a batch after the step, from what is left of their gradients; leaves the steps of those that were
-    eliminated in `right`, zero for the others."""
-    for p in range(end - begin):
-        point, kept, right, root = tracks.point[begin + p], tracks.kept[begin + p], slots.right, slots.root
+def _move(tracks, begin, end, images, slot, placed, points, damping, step, back, moved_points):
+    """Points after the step; the sum of their squared steps times the diagonal of their normal matrices."""
+    r, t, unknown, squares = placed.rig_rotation, placed.rig_translation, 6 * placed.rig_rotation.shape[0], 0.0
+    for track in range(begin, end):
+        point, kept = tracks.point[track], tracks.kept[track]
+        px, py, pz = points[point, 0], points[point, 1], points[point, 2]
         if kept >= 0:
             for i in range(3):
                 moved_points[point, i] = points[point, i] + step[unknown + kept + i]
-                right[p, i] = 0.0
             continue
-        h0 = root[p, 0, 0] * right[p, 0]
-        h1 = root[p, 1, 0] * right[p, 0] + root[p, 1, 1] * right[p, 1]
-        h2 = root[p, 2, 0] * right[p, 0] + root[p, 2, 1] * right[p, 1] + root[p, 2, 2] * right[p, 2]
-        right[p, 0] = -(root[p, 0, 0] * h0 + root[p, 1, 0] * h1 + root[p, 2, 0] * h2)
-        right[p, 1] = -(root[p, 1, 1] * h1 + root[p, 2, 1] * h2)
-        right[p, 2] = -root[p, 2, 2] * h2
-        for i in range(3):
-            moved_points[point, i] = points[point, i] + right[p, i]
+        wx, wy, wz, s, m = 0.0, 0.0, 0.0, -1, slot[track] - 1  # W' step
+        for at in range(tracks.start[track], tracks.start[track + 1]):
+            here = images.station[tracks.image[at]]
+            if here == s:
+                continue
+            s, m = here, m + 1
+            x = r[s, 0, 0] * px + r[s, 0, 1] * py + r[s, 0, 2] * pz + t[s, 0]
+            y = r[s, 1, 0] * px + r[s, 1, 1] * py + r[s, 1, 2] * pz + t[s, 1]
+            z = r[s, 2, 0] * px + r[s, 2, 1] * py + r[s, 2, 2] * pz + t[s, 2]
+            k = 6 * s
+            u = y * step[k + 2] - z * step[k + 1] - step[k + 3]
+            v = z * step[k] - x * step[k + 2] - step[k + 4]
+            w = x * step[k + 1] - y * step[k] - step[k + 5]
+            q = back.square
+            a = q[m, 0] * u + q[m, 1] * v + q[m, 2] * w
+            b = q[m, 1] * u + q[m, 3] * v + q[m, 4] * w
+            c = q[m, 2] * u + q[m, 4] * v + q[m, 5] * w
+            wx += r[s, 0, 0] * a + r[s, 1, 0] * b + r[s, 2, 0] * c
+            wy += r[s, 0, 1] * a + r[s, 1, 1] * b + r[s, 2, 1] * c
+            wz += r[s, 0, 2] * a + r[s, 1, 2] * b + r[s, 2, 2] * c
+        f, h = back.root, back.right
+        h0 = h[track, 0] + f[track, 0] * wx
+        h1 = h[track, 1] + f[track, 1] * wx + f[track, 2] * wy
+        h2 = h[track, 2] + f[track, 3] * wx + f[track, 4] * wy + f[track, 5] * wz
+        dx = f[track, 0] * h0 + f[track, 1] * h1 + f[track, 3] * h2
+        dy = f[track, 2] * h1 + f[track, 4] * h2
+        dz = f[track, 5] * h2
+        moved_points[point, 0], moved_points[point, 1], moved_points[point, 2] = px - dx, py - dy, pz - dz
+        if damping > 0.0:
+            squares += _weighed(f, track, dx, dy, dz) / (1.0 + damping)
+    return squares
 
 
 @kernel
-def _predict_by_points(tracks, begin, end, rotation, rays, slots):
-    """Adds to the residuals what the points' steps change."""
-    for p in range(end - begin):
-        x, y, z = slots.right[p, 0], slots.right[p, 1], slots.right[p, 2]
-        for at in range(tracks.start[begin + p], tracks.start[begin + p + 1]):
-            o = at - tracks.start[begin]
-            if rays.slot[o] < 0:
-                continue
-            s = slots.station[rays.slot[o]]
-            for j in range(3):
-                change = rotation[s, j, 0] * x + rotation[s, j, 1] * y + rotation[s, j, 2] * z
-                rays.residual[o, 0] += rays.by_rig[o, 0, j] * change
-                rays.residual[o, 1] += rays.by_rig[o, 1, j] * change
+def _weighed(root, track, dx, dy, dz):
+    """Squares of a step times the diagonal of the matrix whose Cholesky factor has this inverse."""
+    l00, l11, l22 = 1.0 / root[track, 0], 1.0 / root[track, 2], 1.0 / root[track, 5]
+    l10 = -root[track, 1] * l00 * l11
+    l21 = -root[track, 4] * l11 * l22
+    l20 = -(root[track, 3] * l00 + root[track, 4] * l10) * l22
+    return l00 * l00 * dx * dx + (l10 * l10 + l11 * l11) * dy * dy + (l20 * l20 + l21 * l21 + l22 * l22) * dz * dz
 
 
 @kernel
@@ -124,7 +90,6 @@ def _cost(tracks, begin, end, images, placed, points, cauchy, hidden_square):
         placed.cam_translation,
         placed.parameters,
     )
-    seen = np.empty(8)
     for track in range(begin, end):
         point, last, x, y, z = tracks.point[track], -1, 0.0, 0.0, 0.0
         px, py, pz = points[point, 0], points[point, 1], points[point, 2]
@@ -140,9 +105,10 @@ def _cost(tracks, begin, end, images, placed, points, cauchy, hidden_square):
             v = c[m, 1, 0] * x + c[m, 1, 1] * y + c[m, 1, 2] * z + d[m, 1]
             w = c[m, 2, 0] * x + c[m, 2, 1] * y + c[m, 2, 2] * z + d[m, 2]
             square = hidden_square
-            if lens(placed.model[row], k, row, u, v, w, seen):
-                a = (seen[0] * k[row, 0] + k[row, 2] - tracks.pixel[at, 0]) * tracks.weight[at]
-                b = (seen[1] * k[row, 1] + k[row, 3] - tracks.pixel[at, 1]) * tracks.weight[at]
+            shown, iu, iv, _, _, _, _, _, _ = lens(placed.model[row], k, row, u, v, w)
+            if shown:
+                a = (iu * k[row, 0] + k[row, 2] - tracks.pixel[at, 0]) * tracks.weight[at]
+                b = (iv * k[row, 1] + k[row, 3] - tracks.pixel[at, 1]) * tracks.weight[at]
                 square = a * a + b * b
             else:
                 hidden += 1

@@ -9,8 +9,6 @@ from __future__ import annotations
 
 from math import log1p, sqrt
 
-import numpy as np
-
 from georef.estimation.adjustment.kernels import by_unknown, kernel, lens
 
 _UNDETERMINED, _HELD = 1e-12, 1e-10  # of the trace of a point's normal matrix
@@ -19,47 +17,63 @@ _UNDETERMINED, _HELD = 1e-12, 1e-10  # of the trace of a point's normal matrix
 @kernel
 def linearize(tracks, begin, end, images, placed, points, cauchy, rays, slots):
     """Linearises all observations of tracks begin to end; their cost, and how many no lens shows."""
-    count, cost, hidden = 0, 0.0, 0
-    r, t, c, d = placed.rig_rotation, placed.rig_translation, placed.cam_rotation, placed.cam_translation
-    seen = np.empty(8)
+    count, cost, hidden, offset = 0, 0.0, 0, tracks.start[begin]
+    x, y, z = 0.0, 0.0, 0.0
+    r, t, c, d, k = (
+        placed.rig_rotation,
+        placed.rig_translation,
+        placed.cam_rotation,
+        placed.cam_translation,
+        placed.parameters,
+    )
     for track in range(begin, end):
         slots.first[track - begin] = count
         point, last = tracks.point[track], -1
         px, py, pz = points[point, 0], points[point, 1], points[point, 2]
         for at in range(tracks.start[track], tracks.start[track + 1]):
-            o, view = at - tracks.start[begin], tracks.image[at]
-            s, m, k = images.station[view], images.mounting[view], images.calibration[view]
+            o, view = at - offset, tracks.image[at]
+            s, m, row = images.station[view], images.mounting[view], images.calibration[view]
             if s != last:
-                last, slots.station[count] = s, s
-                for i in range(3):
-                    slots.q[count, i] = r[s, i, 0] * px + r[s, i, 1] * py + r[s, i, 2] * pz + t[s, i]
+                last = s
+                x = r[s, 0, 0] * px + r[s, 0, 1] * py + r[s, 0, 2] * pz + t[s, 0]
+                y = r[s, 1, 0] * px + r[s, 1, 1] * py + r[s, 1, 2] * pz + t[s, 1]
+                z = r[s, 2, 0] * px + r[s, 2, 1] * py + r[s, 2, 2] * pz + t[s, 2]
+                slots.station[count] = s
+                slots.q[count, 0], slots.q[count, 1], slots.q[count, 2] = x, y, z
                 count += 1
-            x, y, z = slots.q[count - 1, 0], slots.q[count - 1, 1], slots.q[count - 1, 2]
-            u = c[m, 0, 0] * x + c[m, 0, 1] * y + c[m, 0, 2] * z + d[m, 0]
-            v = c[m, 1, 0] * x + c[m, 1, 1] * y + c[m, 1, 2] * z + d[m, 1]
-            w = c[m, 2, 0] * x + c[m, 2, 1] * y + c[m, 2, 2] * z + d[m, 2]
+            # Values in hand, not read again: the compiler must take any array that is written for any other.
+            c00, c01, c02 = c[m, 0, 0], c[m, 0, 1], c[m, 0, 2]
+            c10, c11, c12 = c[m, 1, 0], c[m, 1, 1], c[m, 1, 2]
+            c20, c21, c22 = c[m, 2, 0], c[m, 2, 1], c[m, 2, 2]
+            u = c00 * x + c01 * y + c02 * z + d[m, 0]
+            v = c10 * x + c11 * y + c12 * z + d[m, 1]
+            w = c20 * x + c21 * y + c22 * z + d[m, 2]
             rays.columns[o] = 0
-            if not lens(placed.model[k], placed.parameters, k, u, v, w, seen):
+            shown, iu, iv, e0, e1, e2, f0, f1, f2 = lens(placed.model[row], k, row, u, v, w)
+            if not shown:
                 rays.slot[o] = -1
                 hidden += 1
                 continue
-            rays.slot[o] = count - 1
-            rays.cam[o, 0], rays.cam[o, 1], rays.cam[o, 2] = u, v, w
-            rays.image[o, 0], rays.image[o, 1] = seen[0], seen[1]
-            weight = tracks.weight[at]
-            a = (seen[0] * placed.parameters[k, 0] + placed.parameters[k, 2] - tracks.pixel[at, 0]) * weight
-            b = (seen[1] * placed.parameters[k, 1] + placed.parameters[k, 3] - tracks.pixel[at, 1]) * weight
+            weight, fx, fy = tracks.weight[at], k[row, 0], k[row, 1]
+            a = (iu * fx + k[row, 2] - tracks.pixel[at, 0]) * weight
+            b = (iv * fy + k[row, 3] - tracks.pixel[at, 1]) * weight
+            damp = root_weight(a * a + b * b, cauchy)
             cost += loss(a * a + b * b, cauchy)
-            weight *= root_weight(a * a + b * b, cauchy)
-            rays.scale[o] = weight
-            damp = weight / tracks.weight[at]
+            weight *= damp
+            rays.slot[o], rays.scale[o] = count - 1, weight
             rays.residual[o, 0], rays.residual[o, 1] = a * damp, b * damp
-            for i in range(2):
-                f = placed.parameters[k, i] * weight
-                e0, e1, e2 = seen[2 + 3 * i] * f, seen[3 + 3 * i] * f, seen[4 + 3 * i] * f
-                rays.by_cam[o, i, 0], rays.by_cam[o, i, 1], rays.by_cam[o, i, 2] = e0, e1, e2
-                for j in range(3):
-                    rays.by_rig[o, i, j] = e0 * c[m, 0, j] + e1 * c[m, 1, j] + e2 * c[m, 2, j]
+            rays.cam[o, 0], rays.cam[o, 1], rays.cam[o, 2] = u, v, w
+            rays.image[o, 0], rays.image[o, 1] = iu, iv
+            fx, fy = fx * weight, fy * weight
+            e0, e1, e2, f0, f1, f2 = e0 * fx, e1 * fx, e2 * fx, f0 * fy, f1 * fy, f2 * fy
+            rays.by_cam[o, 0, 0], rays.by_cam[o, 0, 1], rays.by_cam[o, 0, 2] = e0, e1, e2
+            rays.by_cam[o, 1, 0], rays.by_cam[o, 1, 1], rays.by_cam[o, 1, 2] = f0, f1, f2
+            rays.by_rig[o, 0, 0] = e0 * c00 + e1 * c10 + e2 * c20
+            rays.by_rig[o, 0, 1] = e0 * c01 + e1 * c11 + e2 * c21
+            rays.by_rig[o, 0, 2] = e0 * c02 + e1 * c12 + e2 * c22
+            rays.by_rig[o, 1, 0] = f0 * c00 + f1 * c10 + f2 * c20
+            rays.by_rig[o, 1, 1] = f0 * c01 + f1 * c11 + f2 * c21
+            rays.by_rig[o, 1, 2] = f0 * c02 + f1 * c12 + f2 * c22
     slots.first[end - begin] = count
     return cost, hidden
 
@@ -134,21 +148,29 @@ def keep(tracks, begin, end, placed, rays, slots):
 @kernel
 def sum_stations(count, slot_count, rays, slots):
     """G'G and G'r of all slots of a batch from its `count` observations."""
-    for s in range(slot_count):
-        for i in range(3):
-            slots.slope[s, i] = 0.0
-            for j in range(3):
-                slots.square[s, i, j] = 0.0
+    square, slope = slots.square, slots.slope
+    square[:slot_count] = 0.0
+    slope[:slot_count] = 0.0
     for o in range(count):
         s = rays.slot[o]
         if s < 0:
             continue
         u, v = rays.residual[o, 0], rays.residual[o, 1]
-        for i in range(3):
-            a, b = rays.by_rig[o, 0, i], rays.by_rig[o, 1, i]
-            slots.slope[s, i] += a * u + b * v
-            for j in range(3):
-                slots.square[s, i, j] += a * rays.by_rig[o, 0, j] + b * rays.by_rig[o, 1, j]
+        a0, a1, a2 = rays.by_rig[o, 0, 0], rays.by_rig[o, 0, 1], rays.by_rig[o, 0, 2]
+        b0, b1, b2 = rays.by_rig[o, 1, 0], rays.by_rig[o, 1, 1], rays.by_rig[o, 1, 2]
+        slope[s, 0] += a0 * u + b0 * v
+        slope[s, 1] += a1 * u + b1 * v
+        slope[s, 2] += a2 * u + b2 * v
+        xy, xz, yz = a0 * a1 + b0 * b1, a0 * a2 + b0 * b2, a1 * a2 + b1 * b2
+        square[s, 0, 0] += a0 * a0 + b0 * b0
+        square[s, 0, 1] += xy
+        square[s, 0, 2] += xz
+        square[s, 1, 0] += xy
+        square[s, 1, 1] += a1 * a1 + b1 * b1
+        square[s, 1, 2] += yz
+        square[s, 2, 0] += xz
+        square[s, 2, 1] += yz
+        square[s, 2, 2] += a2 * a2 + b2 * b2
 
 
 @kernel
@@ -157,28 +179,7 @@ def point_normals(tracks, begin, end, placed, points, information, shift, dampin
     many points their rays leave undetermined."""
     loose = 0
     for p in range(end - begin):
-        for i in range(3):
-            slots.right[p, i] = 0.0
-            for j in range(3):
-                slots.normal[p, i, j] = 0.0
-        for s in range(slots.first[p], slots.first[p + 1]):
-            station = slots.station[s]
-            for j in range(3):
-                r0, r1, r2 = (
-                    placed.rig_rotation[station, 0, j],
-                    placed.rig_rotation[station, 1, j],
-                    placed.rig_rotation[station, 2, j],
-                )
-                slots.right[p, j] += r0 * slots.slope[s, 0] + r1 * slots.slope[s, 1] + r2 * slots.slope[s, 2]
-                for i in range(3):
-                    m = slots.square[s, i, 0] * r0 + slots.square[s, i, 1] * r1 + slots.square[s, i, 2] * r2
-                    slots.mixed[s, i, j] = m
-            for i in range(3):
-                for j in range(3):
-                    total = 0.0
-                    for k in range(3):
-                        total += placed.rig_rotation[station, k, i] * slots.mixed[s, k, j]
-                    slots.normal[p, i, j] += total
+        _sum_point(p, slots.first[p], slots.first[p + 1], placed.rig_rotation, slots)
         row, point = tracks.prior[begin + p], tracks.point[begin + p]
         if row >= 0:
             for i in range(3):
@@ -189,6 +190,37 @@ def point_normals(tracks, begin, end, placed, points, information, shift, dampin
         if tracks.kept[begin + p] < 0:
             loose += invert_root(slots.normal, p, damping, slots.root)
     return loose
+
+
+@kernel
+def _sum_point(p, first, last, r, slots):
+    """Sums R'G'GR and R'G'r of a point's slots first to last; leaves G'GR of each in `mixed`."""
+    xx, xy, xz, yy, yz, zz, gx, gy, gz = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    mixed, square, slope = slots.mixed, slots.square, slots.slope
+    for s in range(first, last):
+        k = slots.station[s]
+        r00, r01, r02 = r[k, 0, 0], r[k, 0, 1], r[k, 0, 2]
+        r10, r11, r12 = r[k, 1, 0], r[k, 1, 1], r[k, 1, 2]
+        r20, r21, r22 = r[k, 2, 0], r[k, 2, 1], r[k, 2, 2]
+        a, b, c = square[s, 0, 0], square[s, 0, 1], square[s, 0, 2]
+        d, e, f = square[s, 1, 1], square[s, 1, 2], square[s, 2, 2]
+        u, v, w = slope[s, 0], slope[s, 1], slope[s, 2]
+        m00, m01, m02 = a * r00 + b * r10 + c * r20, a * r01 + b * r11 + c * r21, a * r02 + b * r12 + c * r22
+        m10, m11, m12 = b * r00 + d * r10 + e * r20, b * r01 + d * r11 + e * r21, b * r02 + d * r12 + e * r22
+        m20, m21, m22 = c * r00 + e * r10 + f * r20, c * r01 + e * r11 + f * r21, c * r02 + e * r12 + f * r22
+        mixed[s, 0, 0], mixed[s, 0, 1], mixed[s, 0, 2] = m00, m01, m02
+        mixed[s, 1, 0], mixed[s, 1, 1], mixed[s, 1, 2] = m10, m11, m12
+        mixed[s, 2, 0], mixed[s, 2, 1], mixed[s, 2, 2] = m20, m21, m22
+        xx, xy = xx + r00 * m00 + r10 * m10 + r20 * m20, xy + r00 * m01 + r10 * m11 + r20 * m21
+        xz, yy = xz + r00 * m02 + r10 * m12 + r20 * m22, yy + r01 * m01 + r11 * m11 + r21 * m21
+        yz, zz = yz + r01 * m02 + r11 * m12 + r21 * m22, zz + r02 * m02 + r12 * m12 + r22 * m22
+        gx, gy = gx + r00 * u + r10 * v + r20 * w, gy + r01 * u + r11 * v + r21 * w
+        gz += r02 * u + r12 * v + r22 * w
+    normal, right = slots.normal, slots.right
+    right[p, 0], right[p, 1], right[p, 2] = gx, gy, gz
+    normal[p, 0, 0], normal[p, 0, 1], normal[p, 0, 2] = xx, xy, xz
+    normal[p, 1, 0], normal[p, 1, 1], normal[p, 1, 2] = xy, yy, yz
+    normal[p, 2, 0], normal[p, 2, 1], normal[p, 2, 2] = xz, yz, zz
 
 
 @kernel

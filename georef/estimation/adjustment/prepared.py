@@ -8,7 +8,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from georef.estimation.adjustment.batches import Tracks, Work, work_for
+from georef.estimation.adjustment.batches import Back, Pairs, Tracks, Work, work_for
 from georef.estimation.adjustment.block import Block, Indices, State
 from georef.estimation.adjustment.block_cholesky import Pattern
 from georef.estimation.adjustment.kernels import (
@@ -57,6 +57,16 @@ class Prepared:
     def pattern(self) -> Pattern:
         """The order in which stations are eliminated, found once for all matrices of this pattern."""
         return Pattern.of(self.first, self.column)
+
+    @cached_property
+    def pairs(self) -> Pairs:
+        tracks, station = self.tracks, self.images.station
+        slot, first = _slots(tracks.start, tracks.image, tracks.kept, station)
+        return Pairs(slot, first, _entries(tracks, station, first, self.first, self.column))
+
+    def back(self) -> Back:
+        """Memory for what one iteration leaves to its back-substitution."""
+        return Back.empty(int(self.pairs.slot[-1]), len(self.tracks.point))
 
     def restricted(self, block: Block, kept: NDArray[np.bool_] | None = None) -> Prepared:
         """The same for a block that lacks some of the observations or constraints: what is left is not sorted again.
@@ -211,6 +221,47 @@ def _incidence(start, image, kept, station):
                 m += 1
         ends[begin:m] = m
     return stations, tracks, ends
+
+
+@kernel
+def _slots(start, image, kept, station):
+    """First slot (T + 1,) and first pair (T + 1,) of each track; tracks that are kept have no pairs."""
+    slot, first = np.zeros(start.shape[0], np.int64), np.zeros(start.shape[0], np.int64)
+    for track in range(start.shape[0] - 1):
+        last, count = -1, 0
+        for at in range(start[track], start[track + 1]):
+            if station[image[at]] != last:
+                last = station[image[at]]
+                count += 1
+        slot[track + 1] = slot[track] + count
+        first[track + 1] = first[track] + (count * (count + 1) // 2 if kept[track] < 0 else 0)
+    return slot, first
+
+
+@kernel
+def _entries(tracks, station, first_pair, first, column):
+    """Place in the pattern (first, column) of all pairs of stations of tracks that are eliminated, as in `Pairs`."""
+    out = np.empty(first_pair[-1], np.int32)
+    for track in range(tracks.start.shape[0] - 1):
+        pair, end = first_pair[track], tracks.start[track + 1]
+        if first_pair[track + 1] == pair:
+            continue
+        row = -1
+        for at in range(tracks.start[track], end):
+            if station[tracks.image[at]] == row:
+                continue
+            row, last = station[tracks.image[at]], -1
+            entry = first[row]
+            for other in range(at, end):
+                there = station[tracks.image[other]]
+                if there == last:
+                    continue
+                last = there
+                while column[entry] != there:
+                    entry += 1
+                out[pair] = entry
+                pair += 1
+    return out
 
 
 @kernel

@@ -16,10 +16,11 @@ import numpy as np
 from georef.errors import GeorefError
 from georef.estimation.adjustment.block import Block, State
 from georef.estimation.adjustment.block_cholesky import SingularMatrix
-from georef.estimation.adjustment.eliminate import Linearized, Losses
-from georef.estimation.adjustment.equations import BlockEquations, Equations
+from georef.estimation.adjustment.eliminate import Linearized, Losses, normal_equations
+from georef.estimation.adjustment.equations import BlockEquations, Equations, Moved
 from georef.estimation.adjustment.prepared import Prepared
-from georef.estimation.adjustment.reduced_solve import reduced_step
+from georef.estimation.adjustment.reduced import Layout
+from georef.estimation.adjustment.reduced_solve import StepSolver
 from georef.geometry.rigid import Array
 
 _log = logging.getLogger(__name__)
@@ -88,7 +89,7 @@ def solve_block(
     determine all unknowns.
     """
     equations = equations or BlockEquations(block, losses, prepared)
-    return _Solver(block, options or SolverOptions(), equations).run(start or block.start(), on_iteration)
+    return Minimizer(block, options or SolverOptions(), _Whole(equations)).run(start or block.start(), on_iteration)
 
 
 class Solve(Protocol):
@@ -116,21 +117,72 @@ class _Trial(NamedTuple):
     hidden: int
 
 
-class _Solver:
-    """One adjustment under way."""
+class Model(Protocol):
+    """What linearising at a state tells of it, as in `Linearized`."""
 
-    def __init__(self, block: Block, options: SolverOptions, equations: Equations) -> None:
-        self._block, self._options, self._equations = block, options, equations
-        self._pattern, self._hidden_cost = equations.pattern, equations.hidden_cost
+    @property
+    def cost(self) -> float: ...
+    @property
+    def hidden(self) -> int: ...
+    @property
+    def undetermined(self) -> int: ...
+
+
+class Attempts(Protocol):
+    """Whoever linearises a block, solves its equations and says what the step does.
+
+    hidden_cost: what an image observation costs that no lens shows.
+    """
+
+    @property
+    def layout(self) -> Layout: ...
+    @property
+    def hidden_cost(self) -> float: ...
+
+    def linearized(self, state: State, damping: float) -> Model: ...
+
+    def attempt(self, state: State, damping: float) -> tuple[Array, Moved, float]:
+        """The step (6 S + B,) of the equations that were linearised last, at this state and damping; where it leads;
+        the decrease of the cost that the linear model promised. Raises SingularMatrix."""
+        ...
+
+
+class _Whole:
+    """Attempts on a block whose equations are in one piece."""
+
+    def __init__(self, equations: Equations) -> None:
+        self._equations, self.layout, self.hidden_cost = equations, equations.layout, equations.hidden_cost
+        self._steps, self._lin = StepSolver(equations.pattern), None
+
+    _lin: Linearized | None
+
+    def linearized(self, state: State, damping: float) -> Linearized:
+        self._lin = None  # its memory is free for the next
+        self._lin = self._equations.linearized(state, damping)
+        return self._lin
+
+    def attempt(self, state: State, damping: float) -> tuple[Array, Moved, float]:
+        assert self._lin is not None
+        lin = self._lin
+        step = self._steps.step(lin.reduced, damping * lin.diagonal)
+        moved = self._equations.moved(state, step, damping)
+        return step, moved, promised_decrease(lin.gain, lin.reduced.gradient, lin.diagonal, step, damping, moved)
+
+
+class Minimizer:
+    """One adjustment under way: steps that lower the cost, damped as far as they have to be."""
+
+    def __init__(self, block: Block, options: SolverOptions, attempts: Attempts) -> None:
+        self._block, self._options, self._attempts = block, options, attempts
 
     def run(self, state: State, on_iteration: Callable[[Iteration], None] | None) -> BlockSolution:
         damping, number = self._options.damping, 0
-        lin = self._equations.linearized(state, damping)
+        lin = self._attempts.linearized(state, damping)
         while True:
             number += 1
             before = lin.cost
             trial, used, lin = self._accepted_step(state, lin, damping)
-            state, cost = trial.state, trial.cost - trial.hidden * self._hidden_cost
+            state, cost = trial.state, trial.cost - trial.hidden * self._attempts.hidden_cost
             largest = float(np.abs(trial.step).max(initial=0.0))
             small = largest < self._options.step_tolerance or before - cost < self._options.cost_tolerance * before
             # Only a step without damping says that the solution is unique.
@@ -141,19 +193,19 @@ class _Solver:
                 on_iteration(Iteration(number, state, cost, largest, used, damping))
             if converged or number >= self._options.max_iterations:
                 return BlockSolution(state, cost, number, converged, trial.hidden, lin.undetermined)
-            lin = self._equations.linearized(state, damping)
+            lin = self._attempts.linearized(state, damping)
 
-    def _accepted_step(self, state: State, lin: Linearized, damping: float) -> tuple[_Trial, float, Linearized]:
+    def _accepted_step(self, state: State, lin: Model, damping: float) -> tuple[_Trial, float, Model]:
         """The first step that lowers the cost, its damping, and the equations it came from."""
         growth = 10.0
-        cost = lin.cost + lin.hidden * self._hidden_cost
+        cost = lin.cost + lin.hidden * self._attempts.hidden_cost
         while damping < _HIGHEST_DAMPING:
-            trial = self._trial(state, lin, damping, cost)
+            trial = self._trial(state, damping, cost)
             if trial is not None and trial.ratio > 0.0:
                 return trial, damping, lin
             damping = max(damping * growth, 1e-6)
             growth *= 2.0
-            lin = self._equations.linearized(state, damping)
+            lin = self._attempts.linearized(state, damping)
         raise GeorefError(
             "The adjustment finds no step that improves it: its approximate values are too far off.",
             "Check approximate poses, units and the coordinate reference system of the constraints.",
@@ -166,28 +218,40 @@ class _Solver:
         lower = damping * factor
         return max(lower if lower > _NO_DAMPING else 0.0, lowest)
 
-    def _trial(self, state: State, lin: Linearized, damping: float, before: float) -> _Trial | None:
+    def _trial(self, state: State, damping: float, before: float) -> _Trial | None:
         """The step at a damping from a state of cost `before`; None where the equations have no solution at it."""
         try:
-            step = reduced_step(lin.reduced, self._pattern, damping * lin.diagonal)
+            step, moved, promised = self._attempts.attempt(state, damping)
         except SingularMatrix as error:
             if damping > 0.0:
                 return None
-            raise self._singular(error, state, lin) from None
-        moved = self._equations.moved(state, step, damping)
-        gained, promised = before - moved.cost, moved.promised
+            raise self._singular(error, state) from None
+        gained = before - moved.cost
         lost = abs(promised) <= _ROUNDING * before and abs(gained) <= _ROUNDING * before
         ratio = 1.0 if lost else (gained / promised if promised > 0.0 else -1.0)
         return _Trial(step, moved.state, moved.cost, float(ratio), moved.hidden)
 
-    def _singular(self, error: SingularMatrix, state: State, lin: Linearized) -> GeorefError:
+    def _singular(self, error: SingularMatrix, state: State) -> GeorefError:
         """What is missing, in the words of `datum` where it finds a reason."""
         from georef.estimation.adjustment.datum import explain_singular
         from georef.estimation.adjustment.datum_words import name_of_unknown
 
-        unknown = name_of_unknown(self._block, self._equations.layout, error.unknown)
+        unknown = name_of_unknown(self._block, self._attempts.layout, error.unknown)
         return GeorefError(
             f"The adjustment has no unique solution: its observations and constraints do not fix {unknown}.",
-            explain_singular(self._block, state, lin.reduced)
+            explain_singular(self._block, state, normal_equations(self._block, state).reduced)
             or "Add control points, GNSS positions or pose priors, or hold unknowns that nothing determines.",
         )
+
+
+def promised_decrease(
+    gain: float, gradient: Array, diagonal: Array, step: Array, damping: float, moved: Moved
+) -> float:
+    """Decrease of the cost of the linear model by a step that solves its damped equations; the first three are those
+    of `Linearized`. Over parts of a block it adds up.
+
+    With the damped model m_d = m + damping / 2 step' D step, D the diagonal, and its minimum at the step, the points'
+    own among it, m_d falls by the gain of points alone less half the product of reduced gradient and step.
+    """
+    squares = moved.squares + float(diagonal @ np.square(step))
+    return gain - 0.5 * float(gradient @ step) + 0.5 * damping * squares
