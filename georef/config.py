@@ -134,6 +134,7 @@ class AdjustConfig(Section):
     cauchy_scale: float = Field(default=2.0, gt=0)
     gate_probability: float = Field(default=0.999, gt=0.5, lt=1)
     max_iterations: int = Field(default=30, ge=1)
+    update_from_images: int = Field(default=500, ge=0)
     accept_datum: list[str] = []
 
     @field_validator("accept_datum")

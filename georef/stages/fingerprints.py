@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -70,6 +71,25 @@ def beside_images(project: Project, survey: Survey) -> dict[str, Any]:
 
 def check(project: Project, survey: Survey) -> dict[str, Any]:
     return {"check points": digest_of([_plain(p) for p in survey.check]), **reference_files(project, survey)}
+
+
+def image_inputs(survey: Survey, failed: Mapping[str, object]) -> dict[str, str]:
+    """Of each image of the epoch a digest of all that is said of it, of its file, and of why it has no features."""
+    cut = {cutout.path for cutout in survey.cutouts}
+    return {
+        image.image_id: digest_of(
+            [
+                *(_plain(image), _state(survey.source_of(image))),
+                *(image.path in cut, _plain(survey.epoch.mountings.get(image.image_id)), failed.get(feature_id(image))),
+            ]
+        )
+        for image in survey.epoch.images
+    }
+
+
+def plain_digest(value: Any) -> str:
+    """A hash of a dataclass of arrays, numbers and texts."""
+    return digest_of(_plain(value))
 
 
 def setting(config: Config, name: str) -> Any:

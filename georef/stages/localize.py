@@ -19,8 +19,10 @@ from georef.features.registry import MATCHERS, load_component
 from georef.io.items import item_ids, item_path, read_outcome, write_outcome
 from georef.io.structures import read_structure
 from georef.stages.base import StageContext, StageSummary, feature_id, open_features
+from georef.stages.earlier import note_inputs, take_over
 from georef.stages.failures import internal_failure
 from georef.stages.features import failed_images, load_extractor
+from georef.stages.fingerprints import image_inputs
 from georef.stages.index import SimilarImages, open_index
 from georef.stages.network import read_noise
 from georef.stages.turned import TurnableImage
@@ -30,6 +32,7 @@ from georef.types.results import Localized, Outcome, ReferenceNoise, Rejected, R
 from georef.types.scene import ImageStructure
 
 ITEMS, STRUCTURE = "items", "structure"
+_OF_IMAGES = ("epoch tables", "stage features")  # parts of the fingerprint that tell of images one by one
 
 
 @dataclass
@@ -112,8 +115,12 @@ class LocalizeTask:
 
 
 def run(context: StageContext) -> StageSummary:
-    """Localises every image that has no outcome yet, storing each outcome as it comes."""
+    """Localises every image that has no outcome yet, storing each outcome as it comes; those of images that did not
+    change are taken over from before others were added."""
     folder = context.folder / ITEMS
+    inputs = image_inputs(context.survey, failed_images(context.before["features"]))
+    note_inputs(context.folder, inputs)
+    take_over(context, "localize", ITEMS, inputs, _OF_IMAGES)
     done = item_ids(folder)
     images = context.survey.epoch.images
     pending = [image for image in images if image.image_id not in done]

@@ -11,8 +11,8 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from georef.estimation.adjustment.block import KINDS_OF_POINT, KINDS_OF_POSE, Block, State
-from georef.estimation.adjustment.block_gates import Contradictions, RejectedConstraint, name_of
+from georef.estimation.adjustment.block import KINDS_OF_POINT, Block, State
+from georef.estimation.adjustment.block_gates import Contradictions, RejectedConstraint
 from georef.estimation.adjustment.block_quality import Quality, quality
 from georef.estimation.adjustment.coherent import CoherentBlock, CoherentSearch
 from georef.estimation.adjustment.coherent_members import settled
@@ -25,10 +25,10 @@ from georef.estimation.adjustment.coherent_search import (
 from georef.estimation.adjustment.constraint_terms import DISTANCES, POSE_PRIORS, POSITION_PRIORS, RELATIVE_POSES
 from georef.estimation.adjustment.eliminate import IMAGE_OBSERVATIONS
 from georef.estimation.adjustment.prepared import Prepared
-from georef.estimation.adjustment.shift_rows import AUTOMATIC
+from georef.estimation.adjustment.readmission import agreeing
 from georef.estimation.adjustment.solver import BlockSolution, Solve, SolverOptions, solve_block
 
-_GATE_ROUNDS, _ROBUST_ROUNDS = 3, 2
+_GATE_ROUNDS, _ROBUST_ROUNDS = 4, 2
 _ROBUST_COST_TOLERANCE = 1e-3  # reweighting converges slowly, and gates need no more
 _GATED_STEP = 1e-5  # of a solution that gates follow, m and rad: where the last one stops is the user's choice
 _FAR_OFF = 1.25  # of a sigma against its residuals
@@ -114,10 +114,10 @@ def adjust_block(
     search = search_coherent(
         *(gated.block, state, options.losses), reference_m=options.reference_m, prepared=gated.prepared
     )
-    hand, state, search, rejected = _without_wrong(gated, state, found, search, options, solve)
-    hand, solution, found, more = _refined(hand, state, options, solve)
+    hand, state, search, wrong = _without_wrong(gated, state, found, search, options, solve)
+    hand, solution, found, wrong = _refined(hand, wrong, state, options, solve)
     return AdjustedBlock(
-        *(hand.block, solution, found, rejected + more, search.blocks, search.undecidable),
+        *(hand.block, solution, found, wrong.rejected, search.blocks, search.undecidable),
         *(len(block.observations) - len(hand.block.observations), hand.scale),
     )
 
@@ -143,33 +143,25 @@ def _robust_state(hand: _InHand, state: State, options: BlockOptions, solve: Sol
 
 def _without_wrong(
     hand: _InHand, state: State, found: Quality, search: CoherentSearch, options: BlockOptions, solve: Solve
-) -> tuple[_InHand, State, CoherentSearch, tuple[RejectedConstraint, ...]]:
-    """What is named is taken out, but for what agrees with the rest once the others are out, and so are single gross
-    contradictions. state, found: before that, of the same constraints."""
+) -> tuple[_InHand, State, CoherentSearch, Contradictions]:
+    """What is named is taken out, but for what agrees with the rest once the others are out, and gross contradictions
+    are told. state, found: before that, of the same constraints."""
     lacking = hand
     if search.blocks:
         lacking = hand.given(without_named(hand.block, search))
         state = _robust_state(lacking, state, options, solve)
         found = lacking.quality(state)
-    wrong = Contradictions.of(lacking.block, found.constraints, _gross(options))
-    named_before = named_rows(hand.block, search)
+    poses, points = named_rows(hand.block, search)
+    none = Contradictions.none(hand.block)
+    before = Contradictions({**none.out, "pose_priors": poses, "point_priors": points}, {})
+    wrong = before.joined(hand.block, found.constraints, _gross(options))
     search = settled(
         *(search, hand.block, state, found.cofactors, found.images.points),
         probability=options.gate_probability,
         reference_m=options.reference_m,
     )
-    poses, points = named_rows(hand.block, search)
-    names = {name_of(hand.block, KINDS_OF_POSE[0], int(row)) for row in np.flatnonzero(poses)}
-    names |= {name_of(hand.block, AUTOMATIC, int(row)) for row in np.flatnonzero(points)}
-    poses[np.flatnonzero(~named_before[0])[wrong.poses]] = True
-    points[np.flatnonzero(~named_before[1])[wrong.points]] = True
-    block = replace(
-        wrong.without(lacking.block),
-        pose_priors=hand.block.pose_priors.take(~poses),
-        point_priors=hand.block.point_priors.take(~points),
-    )
-    single = tuple(r for r in wrong.rejected if r.kind not in (KINDS_OF_POSE[0], AUTOMATIC) or r.name not in names)
-    return hand.given(block), state, search, single
+    named = dict(zip(("pose_priors", "point_priors"), named_rows(hand.block, search), strict=True))
+    return hand.given(without_named(hand.block, search)), state, search, wrong.in_the_rest(named)
 
 
 def _gross(options: BlockOptions) -> float:
@@ -177,22 +169,27 @@ def _gross(options: BlockOptions) -> float:
 
 
 def _refined(
-    hand: _InHand, state: State, options: BlockOptions, solve: Solve
-) -> tuple[_InHand, BlockSolution, Quality, tuple[RejectedConstraint, ...]]:
-    """Solutions without robust losses and gates by turns, until a gate changes nothing."""
+    whole: _InHand, wrong: Contradictions, state: State, options: BlockOptions, solve: Solve
+) -> tuple[_InHand, BlockSolution, Quality, Contradictions]:
+    """Solutions without robust losses and gates by turns, until a gate changes nothing. whole: with all constraints
+    that may take part; wrong: those that do not for the time being."""
     rough = replace(options.solver, step_tolerance=max(options.solver.step_tolerance, _GATED_STEP))
+    hand = whole.given(wrong.without(whole.block))
     hand, solution, found = _rescaled(*_solved(hand, state, rough, solve), rough, solve)
-    rejected, solver, settled = (), rough, _SETTLED_SHARE * len(hand.block.observations)
+    solver, settled = rough, _SETTLED_SHARE * len(hand.block.observations)
     for _ in range(_GATE_ROUNDS):
-        wrong = Contradictions.of(hand.block, found.constraints, options.gate_probability)
-        gated = hand.given(wrong.without(hand.block)).gated(found, options.gate_probability)
-        if not wrong.rejected and len(hand.block.observations) - len(gated.block.observations) <= settled:
+        every = replace(_scaled(whole.block, hand.scale / whole.scale), observations=hand.block.observations)
+        again = agreeing(wrong, every, solution.state, found, options.gate_probability)
+        more = wrong.joined(every, found.constraints, options.gate_probability).readmitted(again)
+        gated = hand.given(more.without(every)).gated(found, options.gate_probability)
+        dropped = len(hand.block.observations) - len(gated.block.observations)
+        if more.failed.keys() == wrong.failed.keys() and dropped <= settled:
             break
-        rejected, solver = rejected + wrong.rejected, options.solver
+        wrong, solver = more, options.solver
         hand, solution, found = _solved(gated, solution.state, solver, solve)
     if solver is rough:
         solution = solve(hand.block, options=options.solver, start=solution.state, prepared=hand.prepared)
-    return (*_rescaled(hand, solution, found, options.solver, solve), rejected)
+    return (*_rescaled(hand, solution, found, options.solver, solve), wrong)
 
 
 def _solved(hand: _InHand, state: State, solver: SolverOptions, solve: Solve) -> tuple[_InHand, BlockSolution, Quality]:

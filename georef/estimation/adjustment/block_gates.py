@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from georef.estimation.adjustment.block import KINDS_OF_POINT, KINDS_OF_POSE, Block
+from georef.estimation.adjustment.block import KINDS_OF_POINT, KINDS_OF_POSE, Block, Indices
 from georef.estimation.adjustment.constraint_terms import DISTANCES, POSITION_PRIORS, RELATIVE_POSES
 from georef.estimation.adjustment.group_tests import TermTests
 
@@ -25,48 +26,70 @@ class RejectedConstraint:
     dof: int
 
 
+PARTS = ("pose_priors", "point_priors", "position_priors", "relative_poses", "distances")
+"""Lists of a block whose rows may be rejected."""
+
+
 @dataclass(frozen=True, eq=False)
 class Contradictions:
-    """What fails its test: masks over the lists of a block, and what it was."""
+    """Which rows of the lists of a block are out, by the names of the lists, and the tests that they failed by list and
+    row."""
 
-    poses: NDArray[np.bool_]
-    points: NDArray[np.bool_]
-    positions: NDArray[np.bool_]
-    motions: NDArray[np.bool_]
-    distances: NDArray[np.bool_]
-    rejected: tuple[RejectedConstraint, ...]
+    out: Mapping[str, NDArray[np.bool_]]
+    failed: Mapping[tuple[str, int], RejectedConstraint]
 
     @staticmethod
-    def of(block: Block, tests: list[TermTests], probability: float) -> Contradictions:
-        """Constraints that fail their test at a probability that good ones pass."""
-        rejected: list[RejectedConstraint] = []
-        drop: dict[str, NDArray[np.bool_]] = {
-            "poses": np.zeros(len(block.pose_priors), bool),
-            "points": np.zeros(len(block.point_priors), bool),
-            POSITION_PRIORS: np.zeros(len(block.position_priors), bool),
-            RELATIVE_POSES: np.zeros(len(block.relative_poses), bool),
-            DISTANCES: np.zeros(len(block.distances), bool),
-        }
+    def none(block: Block) -> Contradictions:
+        return Contradictions({part: np.zeros(len(getattr(block, part)), bool) for part in PARTS}, {})
+
+    @property
+    def rejected(self) -> tuple[RejectedConstraint, ...]:
+        return tuple(self.failed.values())
+
+    def without(self, block: Block) -> Block:
+        """The block that has all rows, without those that are out."""
+        return replace(block, **{part: getattr(block, part).take(~out) for part, out in self.out.items()})
+
+    def joined(self, block: Block, tests: list[TermTests], probability: float) -> Contradictions:
+        """With those that fail their test at a probability that good ones pass; tests: of the block without what is out
+        already."""
+        out, failed = {part: rows.copy() for part, rows in self.out.items()}, dict(self.failed)
+        left = {part: np.flatnonzero(~rows) for part, rows in self.out.items()}
         for test in tests:
             if test.name not in GATED:
                 continue
-            part = "poses" if test.name in KINDS_OF_POSE else "points" if test.name in KINDS_OF_POINT else test.name
+            part = _part_of(test.name)
             for k in np.flatnonzero(test.rejected(probability)):
-                row = int(test.row[k])
-                drop[part][row] = True
-                name = name_of(block, test.name, row)
-                rejected.append(RejectedConstraint(test.name, name, float(test.statistic[k]), int(test.dof[k])))
-        return Contradictions(*drop.values(), rejected=tuple(rejected))
+                row = int(left[part][test.row[k]])
+                out[part][row] = True
+                name, dof = name_of(block, test.name, row), int(test.dof[k])
+                failed[part, row] = RejectedConstraint(test.name, name, float(test.statistic[k]), dof)
+        return Contradictions(out, failed)
 
-    def without(self, block: Block) -> Block:
-        return replace(
-            block,
-            pose_priors=block.pose_priors.take(~self.poses),
-            point_priors=block.point_priors.take(~self.points),
-            position_priors=block.position_priors.take(~self.positions),
-            relative_poses=block.relative_poses.take(~self.motions),
-            distances=block.distances.take(~self.distances),
-        )
+    def readmitted(self, rows: Mapping[str, Indices]) -> Contradictions:
+        """With rows of lists that are in again."""
+        out = {part: mask.copy() for part, mask in self.out.items()}
+        for part, again in rows.items():
+            out[part][again] = False
+        return Contradictions(out, {(part, row): one for (part, row), one in self.failed.items() if out[part][row]})
+
+    def in_the_rest(self, taken: Mapping[str, NDArray[np.bool_]]) -> Contradictions:
+        """What failed its test, in a block without some rows of its lists."""
+        left = {part: ~taken.get(part, np.zeros(len(mask), bool)) for part, mask in self.out.items()}
+        place = {part: np.cumsum(mask) - 1 for part, mask in left.items()}
+        failed = {(part, int(place[part][row])): one for (part, row), one in self.failed.items() if left[part][row]}
+        out = {part: np.zeros(int(mask.sum()), bool) for part, mask in left.items()}
+        for part, row in failed:
+            out[part][row] = True
+        return Contradictions(out, failed)
+
+
+def _part_of(kind: str) -> str:
+    if kind in KINDS_OF_POSE:
+        return "pose_priors"
+    if kind in KINDS_OF_POINT:
+        return "point_priors"
+    return {POSITION_PRIORS: "position_priors", RELATIVE_POSES: "relative_poses", DISTANCES: "distances"}[kind]
 
 
 def name_of(block: Block, kind: str, row: int) -> str:

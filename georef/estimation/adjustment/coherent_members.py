@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import cast
 
 import numpy as np
 from scipy.spatial import KDTree
@@ -22,8 +23,8 @@ from georef.estimation.adjustment.coherent import (
     references_of,
     search_limit,
 )
-from georef.estimation.adjustment.coherent_clusters import PointOffsets, clusters
-from georef.estimation.adjustment.constraint_terms import POSE_PRIORS, constraint_terms, whitening
+from georef.estimation.adjustment.coherent_clusters import Offsets, clusters, named
+from georef.estimation.adjustment.constraint_terms import POSE_PRIORS, constraint_terms
 from georef.estimation.adjustment.group_tests import fitted_cofactor
 from georef.geometry.rigid import Array
 
@@ -36,12 +37,12 @@ _SAME = 0.9999  # that two estimates of one shift are taken for the same
 @dataclass(frozen=True, eq=False)
 class _Candidates:
     """Rows of one kind, their stations, and their statistic of dof degrees of freedom: of some of them (places among
-    the rows) with a shift (3,) of covariance (3, 3) taken off."""
+    the rows) with a shift (3,) taken off."""
 
     row: Indices
     station: Indices
     dof: int
-    statistic: Callable[[Indices, Array, Array], Array]
+    statistic: Callable[[Indices, Array], Array]
 
 
 def settled(
@@ -61,25 +62,28 @@ def settled(
     name is none; contradicting points that belong to none may form one by themselves (`coherent_clusters`). block has
     all priors; state, found and points (P, 3, 3), the cofactors, are those of the adjustment that lacks the named ones.
     """
-    of_poses, offsets = _poses(block, state, found), PointOffsets.of(block, state, points)
-    of_points = _points(offsets)
-    pose_owner = _owners(of_poses, [wrong.poses for wrong in search.blocks], search.blocks, probability)
-    point_owner = _owners(of_points, [wrong.points for wrong in search.blocks], search.blocks, probability)
-    blocks = []
-    for k, wrong in enumerate(search.blocks):
-        mine, given = pose_owner == k, point_owner == k
-        if not mine.any() and given.sum() < FEWEST_POINTS:
+    offsets = Offsets.of_poses(block, state, found), Offsets.of_points(block, state, points)
+    of_poses, of_points = _poses(block, state, found), _points(offsets[1])
+    middle = [_middle(wrong, *offsets) for wrong in search.blocks]
+    pose_owner = _owners(of_poses, [wrong.poses for wrong in search.blocks], middle, probability)
+    point_owner = _owners(of_points, [wrong.points for wrong in search.blocks], middle, probability)
+    blocks, limit = [], search_limit(len(block.station_ids))
+    for k in range(len(search.blocks)):
+        mine, given = np.flatnonzero(pose_owner == k), np.flatnonzero(point_owner == k)
+        if not len(mine) and len(given) < FEWEST_POINTS:
             point_owner[given] = -1
             continue
-        stations = np.unique(np.concatenate([of_poses.station[mine], of_points.station[given]]))
-        rows = np.sort(of_points.row[given])
-        names = tuple(block.station_ids[i] for i in stations)
-        references = references_of(block, rows)
-        wrong = replace(wrong, station_ids=names, poses=of_poses.row[mine], points=rows, references=references)
-        blocks.append(wrong)
-    alone = np.flatnonzero((point_owner < 0) & (offsets.squares() > chi2.isf(_CONTRADICTS, 3)))
-    blocks += clusters(block, offsets.take(alone), reference_m**2, search_limit(len(block.station_ids)))
+        members = offsets[0].take(mine) if len(mine) else offsets[1].take(given)
+        blocks.append(named(block, members, bool(len(mine)), reference_m**2, limit))
+    alone = np.flatnonzero((point_owner < 0) & (offsets[1].squares() > chi2.isf(_CONTRADICTS, 3)))
+    blocks += clusters(block, offsets[1].take(alone), reference_m**2, limit)
     return CoherentSearch(tuple(_joined(blocks, block)), search.undecidable)
+
+
+def _middle(wrong: CoherentBlock, poses: Offsets, points: Offsets) -> Array:
+    """The median (3,) of the offsets that a block names: some of them are not its own."""
+    inside = np.isin(poses.row, wrong.poses), np.isin(points.row, wrong.points)
+    return cast(Array, np.median(np.concatenate([poses.off_m[inside[0]], points.off_m[inside[1]]]), axis=0))
 
 
 def _joined(blocks: list[CoherentBlock], block: Block) -> list[CoherentBlock]:
@@ -124,23 +128,21 @@ def _merged(a: CoherentBlock, b: CoherentBlock, block: Block) -> CoherentBlock:
     )
 
 
-def _owners(
-    candidates: _Candidates, named: list[Indices], blocks: tuple[CoherentBlock, ...], probability: float
-) -> Indices:
-    """The block (K,) that each candidate belongs to, or -1."""
-    limit, none = float(chi2.ppf(probability, candidates.dof)), np.zeros(3)
+def _owners(candidates: _Candidates, named: list[Indices], shifts: list[Array], probability: float) -> Indices:
+    """The block (K,) that each candidate belongs to, or -1, by the rows that each names and its shift."""
+    limit = float(chi2.ppf(probability, candidates.dof))
     count = len(candidates.row)
-    given = candidates.statistic(np.arange(count), none, np.zeros((3, 3)))
+    given = candidates.statistic(np.arange(count), np.zeros(3))
     owner, best, own = np.full(count, -1), np.full(count, np.inf), np.full(count, -1)
-    for k, (rows, wrong) in enumerate(zip(named, blocks, strict=True)):
+    for k, (rows, shift) in enumerate(zip(named, shifts, strict=True)):
         mine = np.flatnonzero(np.isin(candidates.row, rows))
         if not len(mine):
             continue
-        corrected = candidates.statistic(mine, wrong.shift_m, np.zeros((3, 3)))
+        corrected = candidates.statistic(mine, shift)
         own[mine[~((given[mine] <= limit) & (given[mine] <= corrected))]] = k
         first, last = candidates.station[mine].min() - _SEAM, candidates.station[mine].max() + _SEAM
         near = np.flatnonzero((candidates.station >= first) & (candidates.station <= last) & ~(given <= limit))
-        corrected = candidates.statistic(near, wrong.shift_m, wrong.cov)
+        corrected = candidates.statistic(near, shift)
         better = (corrected <= limit) & (corrected < best[near])
         owner[near[better]], best[near[better]] = k, corrected[better]
     return np.where(owner >= 0, owner, own)
@@ -151,25 +153,23 @@ def _poses(block: Block, state: State, found: Cofactors) -> _Candidates:
     priors = block.pose_priors
     row = np.flatnonzero(priors.kind == KINDS_OF_POSE.index("localized"))
 
-    def statistic(chosen: Indices, shift: Array, shift_cov: Array) -> Array:
+    def statistic(chosen: Indices, shift: Array) -> Array:
         if not len(chosen):
             return np.zeros(0)
         taken = priors.take(_mask(row[chosen], len(priors)))
         back = replace(taken.world_from_cam, translation=taken.world_from_cam.translation - shift)
         only = replace(block, pose_priors=replace(taken, world_from_cam=back))
         (term,) = (t for t in constraint_terms(only, state, found.layout) if t.name == POSE_PRIORS)
-        by_shift = whitening(taken.cov)[:, :, 3:] @ np.swapaxes(back.rotation, 1, 2)
-        cov = np.eye(6) + fitted_cofactor(term, found) + by_shift @ shift_cov @ np.swapaxes(by_shift, 1, 2)
-        return _squares(term.residual, cov)
+        return _squares(term.residual, np.eye(6) + fitted_cofactor(term, found))
 
     return _Candidates(row, block.station[block.pose_priors.image[row]], 6, statistic)
 
 
-def _points(offsets: PointOffsets) -> _Candidates:
+def _points(offsets: Offsets) -> _Candidates:
     """The same of automatic GCPs."""
     return _Candidates(
         *(offsets.row, offsets.station, 3),
-        lambda chosen, shift, shift_cov: offsets.take(chosen).squares(shift, shift_cov),
+        lambda chosen, shift: offsets.take(chosen).squares(shift),
     )
 
 

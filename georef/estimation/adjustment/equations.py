@@ -111,16 +111,6 @@ class BlockEquations:
         return Moved(after, float(cost), int(hidden), float(squares))
 
 
-def promised_decrease(lin: Linearized, step: Array, damping: float, moved: Moved) -> float:
-    """Decrease of the cost of the linear model by a step that solves its damped equations.
-
-    With the damped model m_d = m + damping / 2 step' D step, D the diagonal, and its minimum at the step, the points'
-    own among it, m_d falls by the gain of points alone less half the product of reduced gradient and step.
-    """
-    squares = moved.squares + float(lin.diagonal @ np.square(step))
-    return lin.gain - 0.5 * float(lin.reduced.gradient @ step) + 0.5 * damping * squares
-
-
 def moved_state(layout: Layout, state: State, step: Array) -> State:
     """The state after a step (6 S + B,) of stations and border; points are copied, kept ones moved."""
     stations, border = step[: 6 * layout.stations].reshape(-1, 6), step[6 * layout.stations :]

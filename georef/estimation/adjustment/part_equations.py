@@ -14,9 +14,10 @@ import numpy as np
 from georef.estimation.adjustment.block import Indices, State
 from georef.estimation.adjustment.block_cholesky import BlockCholesky, Pattern, SingularMatrix
 from georef.estimation.adjustment.eliminate import Linearized, Losses
-from georef.estimation.adjustment.equations import BlockEquations, Moved, promised_decrease
+from georef.estimation.adjustment.equations import BlockEquations
 from georef.estimation.adjustment.partition import Part
 from georef.estimation.adjustment.reduced import Reduced
+from georef.estimation.adjustment.solver import promised_decrease
 from georef.geometry.rigid import Array
 
 
@@ -47,17 +48,29 @@ class Condensed:
     singular: int = -1
 
 
+@dataclass(frozen=True, eq=False)
+class Led:
+    """What a step does in a part: what is inside moves by own (6 I,), its points are then points (P, 3); cost and
+    hidden as in `Moved`, and the decrease of the cost that the linear model promised."""
+
+    own: Array
+    points: Array
+    cost: float
+    promised: float
+    hidden: int
+
+
 class PartEquations:
     """One part at work: it keeps its observations, its points, and its factor between calls."""
 
     def __init__(self, part: Part, losses: Losses) -> None:
         self._part, self._equations = part, BlockEquations(part.block, losses)
         self._split: _Split | None = None
-        self._lin: Linearized | None = None
         self._inside: tuple[BlockCholesky, Array, Array] | None = None  # factor, coupling, gradient of what is inside
         self._points, self._after = part.block.points, part.block.points
         self._state: State = part.block.start()
         self._damping = 0.0
+        self._told: tuple[float, Array, Array] = (0.0, np.zeros(0), np.zeros(0))  # gain, gradient, diagonal
 
     def linearized(self, given: Given) -> Condensed:
         """Linearises, eliminates points and what is inside."""
@@ -66,8 +79,8 @@ class PartEquations:
         elif given.moved:
             self._points = self._after
         self._state, self._damping = _with_points(given.state, self._points), given.damping
-        self._lin = None  # its memory is free for the next
-        self._lin = lin = self._equations.linearized(self._state, given.damping)
+        lin = self._equations.linearized(self._state, given.damping)
+        self._told = lin.gain, lin.reduced.gradient, lin.diagonal
         self._split = self._split or _Split.of(lin.reduced, self._part.inner)
         return self._condensed(lin, self._split)
 
@@ -87,9 +100,8 @@ class PartEquations:
         half = factor.half_solved(np.concatenate([across, gradient[:inner, None]], axis=1))
         return Condensed(matrix - half[:, :-1].T @ half[:, :-1], gradient[inner:] - half[:, :-1].T @ half[:, -1], *rest)
 
-    def moved(self, shared: Array) -> tuple[Array, Array, Moved, float]:
-        """The part's own step (6 I,), its points, what a step of the shared unknowns (6 J + B,) leads to, and the
-        decrease of its cost that the linear model promised."""
+    def moved(self, shared: Array) -> Led:
+        """Where a step of the shared unknowns (6 J + B,) leads."""
         own = np.zeros(0)
         if self._inside is not None:
             factor, across, gradient = self._inside
@@ -97,8 +109,8 @@ class PartEquations:
         step = np.concatenate([own, shared])
         moved = self._equations.moved(self._state, step, self._damping)
         self._after = moved.state.points
-        assert self._lin is not None
-        return own, self._after, moved, promised_decrease(self._lin, step, self._damping, moved)
+        promised = promised_decrease(*self._told, step, self._damping, moved)
+        return Led(own, self._after, moved.cost, promised, moved.hidden)
 
 
 def _with_points(state: State, points: Array) -> State:

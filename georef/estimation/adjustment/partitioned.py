@@ -154,13 +154,12 @@ class PartedBlock:
         step, points = np.zeros(self.layout.size), state.points.copy()
         step[(6 * self._separators[:, None] + np.arange(6)).ravel()] = shared[:edge]
         step[6 * self.layout.stations :] = shared[edge:]
-        for place, (own, moved, _, _) in zip(self._places, done, strict=True):
-            step[place.own], points[place.points] = own, moved
+        for place, led in zip(self._places, done, strict=True):
+            step[place.own], points[place.points] = led.own, led.points
         after = replace(moved_state(self.layout, state, step), points=points)
-        told = [moved for _, _, moved, _ in done]
         self._after = after
-        cost, hidden, squares = (sum(getattr(m, name) for m in told) for name in ("cost", "hidden", "squares"))
-        return step, Moved(after, cost, hidden, squares), sum(promised for *_, promised in done)
+        cost, promised = sum(led.cost for led in done), sum(led.promised for led in done)
+        return step, Moved(after, cost, sum(led.hidden for led in done), squares=0.0), promised
 
     def _shared_step(self, sums: Condensed, damping: float) -> Array:
         """Solves for separators and border, scaled to a unit diagonal before anything was eliminated."""

@@ -17,7 +17,7 @@ from georef.errors import GeorefError
 from georef.estimation.adjustment.block import Block, State
 from georef.estimation.adjustment.block_cholesky import SingularMatrix
 from georef.estimation.adjustment.eliminate import Linearized, Losses, normal_equations
-from georef.estimation.adjustment.equations import BlockEquations, Equations, Moved, promised_decrease
+from georef.estimation.adjustment.equations import BlockEquations, Equations, Moved
 from georef.estimation.adjustment.prepared import Prepared
 from georef.estimation.adjustment.reduced import Layout
 from georef.estimation.adjustment.reduced_solve import StepSolver
@@ -152,19 +152,21 @@ class _Whole:
 
     def __init__(self, equations: Equations) -> None:
         self._equations, self.layout, self.hidden_cost = equations, equations.layout, equations.hidden_cost
-        self._steps = StepSolver(equations.pattern)
-        self._lin: Linearized | None = None
+        self._steps, self._lin = StepSolver(equations.pattern), None
+
+    _lin: Linearized | None
 
     def linearized(self, state: State, damping: float) -> Linearized:
         self._lin = None  # its memory is free for the next
-        self._lin = lin = self._equations.linearized(state, damping)
-        return lin
+        self._lin = self._equations.linearized(state, damping)
+        return self._lin
 
     def attempt(self, state: State, damping: float) -> tuple[Array, Moved, float]:
         assert self._lin is not None
-        step = self._steps.step(self._lin.reduced, damping * self._lin.diagonal)
+        lin = self._lin
+        step = self._steps.step(lin.reduced, damping * lin.diagonal)
         moved = self._equations.moved(state, step, damping)
-        return step, moved, promised_decrease(self._lin, step, damping, moved)
+        return step, moved, promised_decrease(lin.gain, lin.reduced.gradient, lin.diagonal, step, damping, moved)
 
 
 class Minimizer:
@@ -240,3 +242,16 @@ class Minimizer:
             explain_singular(self._block, state, normal_equations(self._block, state).reduced)
             or "Add control points, GNSS positions or pose priors, or hold unknowns that nothing determines.",
         )
+
+
+def promised_decrease(
+    gain: float, gradient: Array, diagonal: Array, step: Array, damping: float, moved: Moved
+) -> float:
+    """Decrease of the cost of the linear model by a step that solves its damped equations; the first three are those
+    of `Linearized`. Over parts of a block it adds up.
+
+    With the damped model m_d = m + damping / 2 step' D step, D the diagonal, and its minimum at the step, the points'
+    own among it, m_d falls by the gain of points alone less half the product of reduced gradient and step.
+    """
+    squares = moved.squares + float(diagonal @ np.square(step))
+    return gain - 0.5 * float(gradient @ step) + 0.5 * damping * squares

@@ -100,6 +100,22 @@ class Standing:
         return np.isin(np.array(block.image_ids, dtype=object), np.array(self.image_ids, dtype=object))
 
 
+def with_lasting_names(block: Block) -> Block:
+    """The block with its automatic GCPs named by the first image that sees each, and the keypoint there: their numbers
+    change with every image that is added."""
+    obs, given = block.observations, block.point_priors
+    automatic = given.kind == KINDS_OF_POINT.index("automatic")
+    order = np.lexsort((obs.keypoint, np.array(block.image_ids, dtype=str)[obs.view], obs.point))
+    seen, first = np.unique(obs.point[order], return_index=True)
+    leader = dict(zip(seen.tolist(), order[first].tolist(), strict=True))
+
+    def name(row: int) -> str:
+        at = leader.get(int(given.point[row])) if automatic[row] else None
+        return given.point_ids[row] if at is None else f"{block.image_ids[obs.view[at]]}#{obs.keypoint[at]}"
+
+    return replace(block, point_priors=replace(given, point_ids=tuple(name(row) for row in range(len(given)))))
+
+
 def constraint_keys(block: Block) -> list[Key]:
     """Kind and name of every constraint that may be rejected."""
     return [(kind, name_of(block, kind, row)) for kind, row in _rows(block)]
