@@ -116,6 +116,12 @@ class StationsConfig(Section):
     gate_probability: float = Field(default=0.999, gt=0.5, lt=1)
 
 
+DATUM_FINDINGS = (
+    *("height offset", "height scale", "heights reversed", "axes swapped", "handedness", "axes turned", "feet"),
+    *("wrong zone", "false origin", "antenna offset", "shift", "turn", "scale", "several", "unrelated", "undecided"),
+)
+
+
 class AdjustConfig(Section):
     constraints: Literal["auto-gcps", "pose-priors", "none"] = "auto-gcps"
     tie_points: bool = True
@@ -129,6 +135,14 @@ class AdjustConfig(Section):
     gate_probability: float = Field(default=0.999, gt=0.5, lt=1)
     max_iterations: int = Field(default=30, ge=1)
     update_from_images: int = Field(default=500, ge=0)
+    accept_datum: list[str] = []
+
+    @field_validator("accept_datum")
+    @classmethod
+    def _findings(cls, value: list[str]) -> list[str]:
+        if set(value) - set(DATUM_FINDINGS):
+            raise ValueError(f"expected some of: {', '.join(DATUM_FINDINGS)}")
+        return value
 
     @field_validator("constraints", mode="before")
     @classmethod

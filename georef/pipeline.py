@@ -104,8 +104,8 @@ STAGES: tuple[Stage, ...] = (
     Stage("tracks", 1, _TRACKS_KEYS, reference_with_images, ("network",), tracks.run, _uses_tracks, of_reference=True),
     Stage("localize", 6, LOCALIZE_KEYS, epoch_files, _BEFORE_LOCALIZE, localize.run),
     Stage("stations", 1, _STATION_KEYS, mountings, _BEFORE_STATIONS, stations.run, applies=stations.wanted),
-    Stage("adjust", 8, ("adjust", "localize", "matching"), control_and_mountings, _BEFORE_ADJUST, adjust.run),
-    Stage("report", 2, ("report",), check, (*_BEFORE_ADJUST, "adjust"), report.run),
+    Stage("adjust", 9, ("adjust", "localize", "matching"), control_and_mountings, _BEFORE_ADJUST, adjust.run),
+    Stage("report", 3, ("report",), check, (*_BEFORE_ADJUST, "adjust"), report.run),
 )
 
 

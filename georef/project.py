@@ -7,16 +7,16 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
 from pydantic import Field, field_validator, model_validator
 
 from georef.config import Config, Section, load_config, merge, parse_overrides, read_toml, validated
+from georef.epoch_sections import EpochSection, PanoramaSection, refuse_cameras_of_panoramas
 from georef.errors import ConfigError
 from georef.sections import AngleConvention, AngleUnit, BlockSection, CrsSection, TableSection
 
 PROJECT_FILE = "project.toml"
-Unknown = Literal["focal", "k1", "k2", "cx", "cy", "aspect"]
 REFERENCE = "reference"  # the name of the only reference epoch of a project
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]*")
 
@@ -33,19 +33,6 @@ class ReferenceSigma(Section):
         return value
 
 
-def _refuse_cameras_of_panoramas(cameras: str | None, panorama: PanoramaSection | None) -> None:
-    if cameras is not None and panorama is not None:
-        raise ValueError("panoramas have no camera table: name their heads with panorama.heads, and leave out cameras")
-
-
-class PanoramaSection(Section):
-    """The images are panoramas; pinhole heads are cut from them, five standard ones without a table of heads."""
-
-    projection: Literal["equirectangular", "cube-map"]
-    heads: str | None = None
-    stitching_radius_m: float | None = Field(default=None, gt=0)
-
-
 class ReferenceSection(Section):
     images: str
     cameras: str | None = None
@@ -59,59 +46,8 @@ class ReferenceSection(Section):
 
     @model_validator(mode="after")
     def _one_source_of_cameras(self) -> ReferenceSection:
-        _refuse_cameras_of_panoramas(self.cameras, self.panorama)
+        refuse_cameras_of_panoramas(self.cameras, self.panorama)
         return self
-
-
-class EpochSection(Section):
-    """rig: a table of how cameras are mounted; images of one `station` in the table of positions were taken together.
-
-    intrinsics: what is not known of the cameras; "estimate" is the focal length, the principal point and k1.
-
-    A principal point that is held where it is not makes poses wrong by more than they state.
-    """
-
-    images: str
-    cameras: str | None = None
-    gnss: str | None = None
-    rig: str | None = None
-    intrinsics: str | tuple[str, ...] | None = None
-    panorama: PanoramaSection | None = None
-    table: TableSection = TableSection()
-
-    @model_validator(mode="after")
-    def _one_source_of_cameras(self) -> EpochSection:
-        _refuse_cameras_of_panoramas(self.cameras, self.panorama)
-        if self.rig is not None and (self.panorama is not None or self.gnss is None):
-            raise ValueError(
-                "a rig needs the column `station` of a table of positions (gnss), which says what was exposed "
-                "together; the heads of a panorama are a rig by themselves: leave out rig"
-            )
-        if self.panorama is not None and self.intrinsics is not None:
-            raise ValueError("the heads of a panorama are known cameras: leave out intrinsics")
-        if self.cameras is None and self.panorama is None and "focal" not in self.unknown:
-            raise ValueError(
-                'nothing says what cameras took its images: name a table with `cameras`, or set intrinsics = "estimate"'
-            )
-        return self
-
-    @field_validator("intrinsics")
-    @classmethod
-    def _possible(cls, value: Any) -> Any:
-        names = (value,) if isinstance(value, str) else value or ()
-        if value != "estimate" and set(names) - set(get_args(Unknown)):
-            known = ", ".join(f'"{name}"' for name in get_args(Unknown))
-            raise ValueError(f'expected "estimate", or a list of {known}')
-        if len(set(names)) < len(names) or {"k1", "k2"} & set(names) == {"k2"}:
-            raise ValueError("each of the intrinsics at most once, and k2 only together with k1")
-        return value
-
-    @property
-    def unknown(self) -> tuple[Unknown, ...]:
-        """Which intrinsics are to be estimated of every image of the epoch."""
-        given = ("focal", "k1", "cx", "cy") if self.intrinsics == "estimate" else self.intrinsics or ()
-        names = (given,) if isinstance(given, str) else given
-        return tuple(name for name in get_args(Unknown) if name in names)
 
 
 class PointsSection(Section):

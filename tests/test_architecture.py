@@ -22,7 +22,8 @@ ALLOWED: dict[str, set[str]] = {
     "crs": {"errors", "geometry"},
     "config": {"errors"},
     "sections": {"config"},
-    "project": {"errors", "config", "sections"},
+    "epoch_sections": {"config", "sections"},
+    "project": {"errors", "config", "sections", "epoch_sections"},
     "executor": {"errors"},
     "progress": set(),
     "io": {"errors", "replacing", "pictures", "geometry", "types", "crs"},
@@ -38,6 +39,7 @@ ALLOWED: dict[str, set[str]] = {
     "stages": {
         *("errors", "cache", "config", "project", "executor", "geometry", "types", "crs", "io", "features", "store"),
         *("evaluation", "estimation", "capture", "simulate", "report", "viewer", "sections"),
+        "epoch_sections",
     },
     # measures what lies below the pipeline
     "benchmarks": {

@@ -5,6 +5,8 @@ from __future__ import annotations
 import codecs
 import difflib
 import logging
+import shutil
+from collections.abc import Iterable
 from pathlib import Path
 
 from georef.errors import InputError
@@ -59,6 +61,18 @@ def write_bytes_atomically(data: bytes, path: Path | str) -> None:
     """
     with replacing(Path(path)) as temporary:
         temporary.write_bytes(data)
+
+
+def write_lines_atomically(lines: Iterable[str], path: Path | str) -> None:
+    """Write lines as they come, UTF-8 with '\\n' line ends, as `write_bytes_atomically` does."""
+    with replacing(Path(path)) as temporary, temporary.open("w", encoding="utf-8", newline="\n") as file:
+        file.writelines(f"{line}\n" for line in lines)
+
+
+def copy_atomically(source: Path, path: Path) -> None:
+    """Copy a file as a whole or not at all."""
+    with replacing(path) as temporary:
+        shutil.copyfile(source, temporary)
 
 
 def _read_bytes(path: Path) -> bytes:

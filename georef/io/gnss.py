@@ -27,6 +27,7 @@ class GnssTable(PositionTable):
     heading_deg: Array  # (N,)
     cameras: tuple[str, ...]
     stations: tuple[str, ...]
+    times_s: Array  # (N,) of exposure, NaN where it is empty or the file has no such column
 
     @property
     def unstated(self) -> bool:
@@ -41,7 +42,7 @@ def read_gnss(
     columns: Mapping[str, str] | None = None,
     table_format: TableFormat | None = None,
 ) -> GnssTable:
-    """Read image, position, three sigmas (m) and optionally heading_deg, camera and station.
+    """Read image, position, three sigmas (m) and optionally heading_deg, camera, station and time_s.
 
     A file may be without any column of sigmas; some of them alone are refused. Raises InputError for columns that are
     missing, values that cannot be, sigmas that are not positive, and images
@@ -61,6 +62,7 @@ def read_gnss(
         heading_deg=_headings(table),
         cameras=table.text("camera") if table.has("camera") else ("",) * len(table),
         stations=table.text("station") if table.has("station") else ("",) * len(table),
+        times_s=table.numbers("time_s", allow_empty=True) if table.has("time_s") else np.full(len(table), np.nan),
     )
 
 

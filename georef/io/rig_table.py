@@ -13,6 +13,7 @@ from georef.io.table import Table
 from georef.io.tables import TableFormat, read_table
 from georef.types.campaign import Mounting
 
+_WIDE_M, _WIDE_DEG = 0.5, 5.0  # of a mounting that nobody states a sigma for: what localization allows
 _ANGLES, _POSITION, _SIGMAS = ("yaw", "pitch", "roll"), ("x", "y", "z"), ("sigma_m", "sigma_deg")
 
 
@@ -23,7 +24,8 @@ def read_rig(
 
     As for the heads of a panorama: x right, y down, z forward of the rig; yaw clockwise from forward, pitch up, roll
     clockwise about the optical axis. The sigmas are of each coordinate and of the rotation about each axis. One camera
-    may have both zero: then the rig is where this camera is. Raises InputError.
+    may have both zero: then the rig is where this camera is. Both empty: nobody knows how good the values are; the
+    adjustment estimates them without a weight. Raises InputError.
     """
     table = read_table(path, columns=columns, table_format=table_format)
     table.require(("camera", *_POSITION, *_ANGLES, *_SIGMAS))
@@ -32,12 +34,20 @@ def read_rig(
     sigmas = _checked_sigmas(table, cameras)
     positions = table.stack(_POSITION)
     return {
-        name: Mounting(name, head_pose(angles[i], positions[i]), _cov(*sigmas[i])) for i, name in enumerate(cameras)
+        name: Mounting(name, head_pose(angles[i], positions[i]), _cov(*sigmas[i]), free=bool(np.isnan(sigmas[i, 0])))
+        for i, name in enumerate(cameras)
     }
 
 
 def _checked_sigmas(table: Table, cameras: tuple[str, ...]) -> Array:
-    sigmas = table.stack(_SIGMAS)
+    sigmas = table.stack(_SIGMAS, allow_empty=True)
+    for i in np.flatnonzero(np.isnan(sigmas).sum(axis=1) == 1)[:1]:
+        raise table.error(
+            int(i),
+            f"Camera {cameras[i]!r} has one of {', '.join(_SIGMAS)}, and not the other.",
+            expected="both, or neither for a mounting that the adjustment estimates without a weight.",
+            remedy="Fill in the other, or empty both.",
+        )
     for i, k in np.argwhere((sigmas < 0) | ((sigmas == 0) & (sigmas.max(axis=1, keepdims=True) > 0)))[:1]:
         raise table.error(
             int(i),
@@ -62,4 +72,6 @@ def _cov(sigma_m: float, sigma_deg: float) -> Array | None:
     """Covariance (6, 6) of a mounting; None where it defines the rig."""
     if sigma_m == 0:
         return None
+    if np.isnan(sigma_m):
+        sigma_m, sigma_deg = _WIDE_M, _WIDE_DEG
     return np.diag([np.radians(sigma_deg) ** 2] * 3 + [sigma_m**2] * 3)

@@ -11,13 +11,15 @@ from scipy.linalg import block_diag
 
 from georef.evaluation.check_points import CheckPointError, CheckPointErrors, CheckPointReport
 from georef.geometry.rigid import Array
-from georef.report.plan import Placed, plan_section
+from georef.report.plan import Placed, placed_in_plan, plan_section
 from georef.types.constraints import CheckKind
 from georef.types.results import Localized, Outcome, Rejected
 
 SCHEMA = 1
 _NO_CHECK = {"count": 0, "kind": None, "rmse_e_m": None, "rmse_n_m": None, "rmse_h_m": None, "rmse_3d_m": None}
 
+_SHARED = ("shared_unknowns", "correlations", "correlations_in_all", "weak_focals")
+_RELIABILITY = ("redundancy", "rejected_constraints", *_SHARED)
 _ADJUSTMENT = ("iterations", "converged", "image_sigma_scale", "coherent_blocks", "undecidable")
 
 
@@ -76,6 +78,9 @@ def build_report(given: ReportInput) -> dict[str, Any]:
         "gates": given.adjustment.get("gates", {}),
         "variance_components": given.adjustment.get("variance_components", {}),
         "adjustment": {key: given.adjustment.get(key) for key in _ADJUSTMENT},
+        "reliability": {key: given.adjustment[key] for key in _RELIABILITY if key in given.adjustment}
+        | {"groups": _reliability_groups(given)},
+        "datum": given.adjustment.get("datum", {}),
         "plan": _plan(given),
         "timings": given.timings,
         "config": given.config,
@@ -138,6 +143,17 @@ def _plan(given: ReportInput) -> dict[str, Any]:
     return plan_section(given.placed, check, control)
 
 
+def _reliability_groups(given: ReportInput) -> dict[str, Any]:
+    """Summaries of the groups; the places of their members in the frame of the plan."""
+    out = {}
+    for name, group in given.adjustment.get("reliability", {}).items():
+        members = group["in_plan"]
+        places = placed_in_plan(given.placed, [member["place_m"] for member in members])
+        moved = [{**member, "position_m": place} for member, place in zip(members, places, strict=True)]
+        out[name] = {**group, "in_plan": [{k: v for k, v in m.items() if k != "place_m"} for m in moved]}
+    return out
+
+
 def _check_section(reports: Mapping[CheckKind, CheckPointReport], given: ReportInput) -> dict[str, Any]:
     """Each kind apart; the first levels repeat the absolute kind if there is one, else the relative."""
     if not reports:
@@ -181,9 +197,12 @@ def _control_section(given: ReportInput) -> dict[str, Any]:
     """Control apart from check: residuals of the points that took part, in CRS axes."""
     points = []
     for entry in given.adjustment.get("control", []):
-        turn = given.axes_from_world[entry["point"]]
-        points.append({**entry, "residual_m": (turn @ entry["residual_m"]).tolist()})
-    residuals = np.array([p["residual_m"] for p in points]).reshape(-1, 3)
+        turned = (given.axes_from_world[entry["point"]] @ entry["residual_m"]).tolist()
+        known = [
+            r if sigma is not None else None for r, sigma in zip(turned, entry.get("sigma_m", turned), strict=True)
+        ]
+        points.append({**entry, "residual_m": known})
+    residuals = np.array([p["residual_m"] for p in points], dtype=np.float64).reshape(-1, 3)
     section: dict[str, Any] = {
         "used": given.surveyed_control,
         "available": len(given.control_ids),
@@ -191,7 +210,8 @@ def _control_section(given: ReportInput) -> dict[str, Any]:
         "points": points,
     }
     if len(points):
-        square = np.square(residuals).mean(axis=0)
+        count = np.maximum(np.isfinite(residuals).sum(axis=0), 1)
+        square = np.nansum(np.square(residuals), axis=0) / count
         e, n, h = np.sqrt(square).tolist()
         section |= {"rmse_e_m": e, "rmse_n_m": n, "rmse_h_m": h, "rmse_3d_m": float(np.sqrt(square.sum()))}
     return section

@@ -80,7 +80,7 @@ def _plan_figure(
 ) -> Markup:
     what = f"{axes[2]} residuals" if height else "Plan with residual vectors" if with_residual else "Plan of stations"
     drawing = Drawing(_WIDTH, _TOP + float(frame.size[1]) + _BOTTOM, what)
-    _map_axes(drawing, frame, axes)
+    map_axes(drawing, frame, axes)
     _stations(drawing, plan["new"], [] if height else plan["reference"], frame, named=not height)
     for point in plan["control"]:
         x, y = frame.at(point["position_m"])
@@ -93,7 +93,8 @@ def _plan_figure(
     return drawing.render()
 
 
-def _map_axes(drawing: Drawing, frame: Plan, axes: Sequence[str]) -> None:
+def map_axes(drawing: Drawing, frame: Plan, axes: Sequence[str]) -> None:
+    """Grid, ticks and names of the axes of a plan."""
     bottom = _TOP + float(frame.size[1])
     for value in ticks(frame.low[0], frame.high[0], 4):
         x, _ = frame.at([value, frame.low[1]])

@@ -8,6 +8,7 @@ from typing import Any
 
 from jinja2 import Environment, PackageLoader, StrictUndefined, Template
 
+from georef.report.detectable_figure import detectable_figures
 from georef.report.figures import MOST_POINTS, MOST_STATIONS, plan_figures
 from georef.report.page import page_values
 from georef.report.residual_figure import residual_figures
@@ -23,7 +24,8 @@ def render_html(report: dict[str, Any]) -> str:
         kind["plans"] = plan_figures(report["plan"], kind["name"], values["axes"])
         kind["residual_figures"] = residual_figures(kind["all_points"], values["axes"])
     stations = [] if values["kinds"] else plan_figures(report["plan"], None, values["axes"])
-    limits = {"most_stations": MOST_STATIONS, "most_points": MOST_POINTS}
+    detectable = detectable_figures(report.get("reliability", {}).get("groups", {}), values["axes"])
+    limits = {"detectable_figures": detectable, "most_stations": MOST_STATIONS, "most_points": MOST_POINTS}
     return page_template("report.html.j2").render(report=report, stations=stations, **limits, **values)
 
 

@@ -38,6 +38,7 @@ def page_values(report: dict[str, Any]) -> dict[str, Any]:
             {"name": GROUPS.get(key, key), "reading": component_reading(c), **c}
             for key, c in report["variance_components"].items()
         ],
+        "reliability": _reliability(report.get("reliability", {})),
         "timings": _timings(report["timings"]),
         "settings": _flat(report["config"]),
     }
@@ -110,6 +111,39 @@ def _images(by_image: list[dict[str, Any]]) -> list[dict[str, Any]]:
 def _gnss_rms(images: list[dict[str, Any]]) -> list[float] | None:
     found = [i["adjustment"]["gnss_residual_m"] for i in images if (i.get("adjustment") or {}).get("gnss_residual_m")]
     return np.sqrt(np.square(np.array(found)).mean(axis=0)).tolist() if found else None
+
+
+def _reliability(section: Mapping[str, Any]) -> dict[str, Any]:
+    """Groups with their names in words; what failed its test with the name of its group."""
+    groups = [
+        {"key": key, "name": GROUPS.get(key, key), **group, "ranges": _ranges(group)}
+        for key, group in section.get("groups", {}).items()
+    ]
+    rejected = [
+        {**one, "group": GROUPS.get(one["kind"], one["kind"])} for one in section.get("rejected_constraints", ())
+    ]
+    return {
+        "groups": groups,
+        "rejected": [{**one, "group": GROUPS.get(one["kind"], one["kind"])} for one in rejected],
+        "redundancy": section.get("redundancy"),
+        "shared": section.get("shared_unknowns", [])[:MOST_ROWS],
+        "correlations": section.get("correlations", []),
+        "correlations_in_all": section.get("correlations_in_all", 0),
+    }
+
+
+def _ranges(group: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """One row an axis: median and worst redundancy number, median and largest detectable bias and its effect."""
+    return [
+        {
+            "axis": index,
+            "redundancy": group["redundancy"][axis],
+            "detectable": group["detectable_m"][axis],
+            "effect": group["effect_m"][axis],
+        }
+        for index, axis in enumerate(("e", "n", "h"))
+        if group["redundancy"][axis] is not None
+    ]
 
 
 def _timings(timings: Mapping[str, dict[str, Any]]) -> list[dict[str, Any]]:

@@ -60,6 +60,15 @@ def plan_section(placed: Placed, check: Mapping[str, Array], control: Mapping[st
     }
 
 
+def placed_in_plan(placed: Placed, places: Sequence[Sequence[float]]) -> list[list[float]]:
+    """Places in world (N, 3) in the frame of the plan."""
+    if not len(places):
+        return []
+    in_crs = placed.world.describe()["kind"] in _METRIC_KINDS
+    frame = _CrsPlan(placed.world) if in_crs else _WorldPlan()
+    return [_round(position) for position in frame.positions(np.array(places, dtype=np.float64))]
+
+
 def nearest(positions: Array, targets: Array, limit: int) -> NDArray[np.int64]:
     """Indices of at most `limit` of the positions (N, 3), those nearest to any target (M, 3), in their order."""
     if len(positions) <= limit:

@@ -22,6 +22,9 @@ GROUPS = {
     "gnss": "GNSS positions",
     "pose_priors": "Poses from localization",
     "control_points": "Surveyed control points",
+    "given_orientations": "Given orientations",
+    "relative_poses": "Measured motions",
+    "distances": "Measured distances",
     "reference_position": "Reference positions",
     "reference_rotation": "Reference rotations",
 }
@@ -80,7 +83,32 @@ def component_reading(component: dict[str, Any]) -> str:
 
 def attention(report: dict[str, Any]) -> list[str]:
     """What a reader must know before using the numbers, most important first."""
-    return [*_of_adjustment(report), *_of_images(report), *_of_points(report), *_of_reference(report)]
+    own = [*_of_adjustment(report), *_of_datum(report), *_of_images(report), *_of_reliability(report)]
+    return [*own, *_of_points(report), *_of_reference(report)]
+
+
+def _of_datum(report: dict[str, Any]) -> list[str]:
+    """What the comparison of map, GNSS and control found beforehand and the user accepted, or what is but suspected."""
+    return [
+        f"{found['text']} {'Accepted (adjust.accept_datum).' if found['accepted'] else found['remedy']}"
+        for pair in report.get("datum", {}).get("comparisons", ())
+        for found in pair["findings"]
+    ]
+
+
+def _of_reliability(report: dict[str, Any]) -> list[str]:
+    """Unknowns that the observations hardly tell apart, and control that nothing checks."""
+    section = report.get("reliability", {})
+    out = [focal["text"].replace("\n", " ") for focal in section.get("weak_focals", ())]
+    pairs = section.get("correlations", ())
+    if pairs:
+        first = "; ".join(f"{p['first']} with {p['second']} ({p['value']:+.3f})" for p in pairs[:3])
+        more = section["correlations_in_all"] - 3
+        out.append(f"Hardly to be told apart (correlation): {first}{f'; {more} more' if more > 0 else ''}.")
+    control = section.get("groups", {}).get("control_points")
+    if control and control["unchecked"]:
+        out.append(f"{_count(control['unchecked'], 'control point')} that nothing checks: an error in it stays unseen.")
+    return out
 
 
 def _of_adjustment(report: dict[str, Any]) -> list[str]:

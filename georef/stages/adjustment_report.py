@@ -12,14 +12,14 @@ from numpy.typing import NDArray
 
 from georef.crs import WorldFrame
 from georef.estimation.adjustment.adjust_block import AdjustedBlock
-from georef.estimation.adjustment.block import KINDS_OF_POINT, KINDS_OF_POSE, Block
+from georef.estimation.adjustment.block import KINDS_OF_POINT, KINDS_OF_POSE, Block, State
 from georef.estimation.adjustment.block_gates import RejectedConstraint
 from georef.estimation.adjustment.coherent import CoherentBlock
 from georef.estimation.adjustment.components import Component
 from georef.estimation.adjustment.constraint_terms import DISTANCES, POSITION_PRIORS, RELATIVE_POSES
 from georef.estimation.adjustment.correlations import shared_unknowns, strong_correlations
 from georef.estimation.adjustment.eliminate import IMAGE_OBSERVATIONS
-from georef.estimation.adjustment.reliability import Reliability, reliability
+from georef.estimation.adjustment.reliability import NO_WEIGHT, Reliability, reliability
 from georef.estimation.adjustment.weak_focal import weak_focals
 from georef.geometry.rigid import Array
 from georef.stages.reliability_data import UNCHECKED, reliability_rows, reliability_summary
@@ -37,6 +37,7 @@ GROUPS = {
 """Names in reports of what a block calls its groups of observations."""
 WITH_RELIABILITY = ("control", "automatic", "localized", POSITION_PRIORS)
 _NAMED_REJECTED, _NAMED_CORRELATIONS = 50, 30
+_FIRST = -1  # in place of a mounting: the first image of a station
 
 
 def adjustment_data(given: Block, adjusted: AdjustedBlock, checked: Mapping[str, Reliability]) -> dict[str, Any]:
@@ -64,6 +65,7 @@ def adjustment_data(given: Block, adjusted: AdjustedBlock, checked: Mapping[str,
         "image_sigma_scale": adjusted.sigma_scale,
         "iterations": solution.iterations,
         "converged": solution.converged,
+        "calibrations": [asdict(camera) for camera in solution.state.cameras if camera.estimate],
         "images_used": _per_image(adjusted),
         "control": _control(given, adjusted, checked),
     }
@@ -201,13 +203,26 @@ def _per_image(adjusted: AdjustedBlock) -> dict[str, Any]:
         name: {"observations": int(n), "residual_rms_px": float(np.sqrt(t / n)) if n else None}
         for name, n, t in zip(block.image_ids, count, total, strict=True)
     }
+    priors, residuals = block.position_priors, _gnss_residuals(block, state)
     places = zip(block.station.tolist(), block.mounting.tolist(), strict=True)
     image_at = dict(zip(places, block.image_ids, strict=True))
-    priors = block.position_priors
-    measured = state.world_from_rig.take(priors.station).apply(state.lever_arms_m[priors.antenna])
-    for station, mounting, offset in zip(priors.station, priors.antenna, measured - priors.position, strict=True):
-        out[image_at[int(station), int(mounting)]]["gnss_residual_m"] = offset.tolist()
+    for image, station in zip(reversed(block.image_ids), reversed(block.station.tolist()), strict=True):
+        image_at[station, _FIRST] = image
+    for station, antenna, offset in zip(priors.station.tolist(), priors.antenna.tolist(), residuals, strict=True):
+        image = image_at.get((station, antenna), image_at[station, _FIRST])  # of an antenna: the station's first
+        out[image]["gnss_residual_m"] = offset.tolist()
     return out
+
+
+def _gnss_residuals(block: Block, state: State) -> Array:
+    """Adjusted less measured positions (K, 3) of antennas, the estimated offset taken off."""
+    priors = block.position_priors
+    antenna = state.world_from_rig.take(priors.station).apply(state.lever_arms_m[priors.antenna])
+    drift = np.zeros((len(priors), 3))
+    for column in range(2):
+        there = priors.drift_node[:, column] >= 0
+        drift[there] += priors.drift_weight[there, column, None] * state.drift_m[priors.drift_node[there, column]]
+    return antenna + drift - priors.position
 
 
 def _control(given: Block, adjusted: AdjustedBlock, checked: Mapping[str, Reliability]) -> list[dict[str, Any]]:
@@ -232,4 +247,5 @@ def _control(given: Block, adjusted: AdjustedBlock, checked: Mapping[str, Reliab
 def _sigmas(information: Array) -> list[tuple[float, bool]]:
     """1-sigma along each axis of an information matrix (3, 3) of any rank, and whether there is one."""
     sigma = np.sqrt(np.diag(np.linalg.pinv(information, hermitian=True)))
-    return [(float(s), bool(w > 0.0)) for s, w in zip(sigma, np.diag(information), strict=True)]
+    weighted = np.diag(information) > NO_WEIGHT * np.diag(information).max(initial=0.0)
+    return [(float(s), bool(w)) for s, w in zip(sigma, weighted, strict=True)]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from itertools import chain
 from pathlib import Path
 from typing import cast
 
@@ -15,7 +16,7 @@ from georef.estimation.adjustment.block_gates import RejectedConstraint
 from georef.estimation.adjustment.reliability import Reliability
 from georef.geometry.rigid import Array
 from georef.io.columns import POSITION_COLUMNS, CrsKind
-from georef.replacing import replacing
+from georef.io.files import write_lines_atomically
 from georef.stages.adjustment_report import GROUPS
 
 TABLES = {
@@ -37,26 +38,20 @@ def write_tables(
     for kind, found in checked.items():
         if len(found):
             paths.append(folder / TABLES[kind])
-            _write(paths[-1], _comments(found), _reliability_lines(found, world))
+            write_lines_atomically(chain(_comments(found), _reliability_lines(found, world)), paths[-1])
     if adjusted.rejected:
         paths.append(folder / REJECTED)
-        comment = "Constraints that contradict all others, by their test when they left."
-        _write(paths[-1], [comment], _rejected_lines(adjusted.rejected))
+        comment = "# Constraints that contradict all others, by their test when they left."
+        write_lines_atomically(chain([comment], _rejected_lines(adjusted.rejected)), paths[-1])
     return paths
-
-
-def _write(path: Path, comments: Sequence[str], lines: Iterator[str]) -> None:
-    with replacing(path) as temporary, temporary.open("w", encoding="utf-8", newline="\n") as file:
-        file.writelines(f"# {comment}\n" for comment in comments)
-        file.writelines(f"{line}\n" for line in lines)
 
 
 def _comments(found: Reliability) -> list[str]:
     return [
-        "Residual: adjusted minus given, along the axes of the CRS at each place; metres, rotations in degrees.",
-        "Detectable: minimal detectable bias (alpha0 0.001, beta0 0.20), inf where nothing checks the component; "
+        "# Residual: adjusted minus given, along the axes of the CRS at each place; metres, rotations in degrees.",
+        "# Detectable: minimal detectable bias (alpha0 0.001, beta0 0.20), inf where nothing checks the component; "
         "effect: how far a bias of that size would move the adjusted position. Empty: the component has no weight.",
-        f"{len(found)} constraints; statistic: of all components of a row together, chi-square with dof.",
+        f"# {len(found)} constraints; statistic: of all components of a row together, chi-square with dof.",
     ]
 
 

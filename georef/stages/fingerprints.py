@@ -15,6 +15,7 @@ from georef.config import Config
 from georef.project import Project
 from georef.stages import features
 from georef.stages.base import feature_id
+from georef.stages.epoch_constraints import check_declared
 from georef.stages.survey import Survey
 from georef.types.campaign import Campaign
 
@@ -50,7 +51,22 @@ def control(project: Project, survey: Survey) -> dict[str, Any]:
 
 
 def control_and_mountings(project: Project, survey: Survey) -> dict[str, Any]:
-    return {**control(project, survey), **mountings(project, survey)}
+    return {**control(project, survey), **mountings(project, survey), **beside_images(project, survey)}
+
+
+def beside_images(project: Project, survey: Survey) -> dict[str, Any]:
+    """What an epoch declares of antenna, offsets, motions, distances and calibrations, with the states of its files."""
+    section = project.file.epochs[survey.epoch.epoch]
+    names = ("antenna", "gnss_offset", "motions", "trajectory", "distances", "calibration", "mountings")
+    declared = section.model_dump(include=set(names), exclude_defaults=True)
+    if not declared:
+        return {}
+    check_declared(project, survey)
+    files = [section.motions, section.trajectory and section.trajectory.file]
+    files += [section.distances and section.distances.file, section.distances and section.distances.marks]
+    states = [_state(project.data(name)) for name in files if name]
+    measured = digest_of([[name, _plain(fix)] for name, fix in survey.epoch.fixes.items()])
+    return {"declared": declared, "files": states, "fixes": measured, "times": dict(survey.epoch.times_s)}
 
 
 def check(project: Project, survey: Survey) -> dict[str, Any]:

@@ -7,8 +7,38 @@ from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
+
 from georef.errors import InputError
-from georef.types.campaign import Campaign, Mounting
+from georef.io.gnss import GnssTable
+from georef.project import EpochSection
+from georef.types.campaign import Campaign, Mounting, PositionPrior
+
+_FREE_OFFSET_M = 100.0  # what localization allows where the offset of GNSS is free
+
+
+def with_fixes(campaign: Campaign, gnss: GnssTable, section: EpochSection) -> Campaign:
+    """The campaign with times of exposure. Where the project declares an antenna or an offset of GNSS, its images have
+    sigmas that allow for these, and the positions stand beside as they were measured."""
+    times = {name: float(t) for name, t in zip(gnss.image_ids, gnss.times_s, strict=True) if np.isfinite(t)}
+    campaign = replace(campaign, times_s=times)
+    if section.antenna is None and section.gnss_offset is None:
+        return campaign
+    wider = np.zeros(3)
+    if section.antenna is not None:
+        sigma = section.antenna.sigma_m if isinstance(section.antenna.sigma_m, tuple) else (0.0,) * 3
+        wider += np.sum(np.square([*section.antenna.lever_arm_m, *sigma]))
+    if section.gnss_offset is not None:
+        sigma = section.gnss_offset.sigma_m
+        wider += np.square(sigma if isinstance(sigma, tuple) else (_FREE_OFFSET_M,) * 3)
+    fixes = {image.image_id: image.gnss for image in campaign.images if image.gnss is not None}
+    images = tuple(
+        replace(image, gnss=PositionPrior(image.gnss.position_in_world, image.gnss.cov + np.diag(wider)))
+        if image.gnss is not None
+        else image
+        for image in campaign.images
+    )
+    return replace(campaign, images=images, fixes=fixes)
 
 
 def with_rig(campaign: Campaign, rig: Mapping[str, Mounting], stations: Path, path: Path) -> Campaign:

@@ -9,13 +9,14 @@ from typing import Any
 from georef.errors import StageError
 from georef.io.files import write_text_atomically
 from georef.report.html import render_html
-from georef.stages.report import HTML, LOCALIZATION, POSES, RECORDING, REPORT
+from georef.stages.report import HTML, LOCALIZATION, POSES, RECORDING, REPORT, TEXT
 
 _WHAT = {
     POSES: "poses after the adjustment",
     LOCALIZATION: "poses of each image alone",
     HTML: "the report to read",
     REPORT: "the report as data",
+    TEXT: "the adjustment as text",
     RECORDING: "the 3D scene: georef view",
 }
 

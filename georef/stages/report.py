@@ -14,13 +14,15 @@ from scipy.linalg import block_diag
 from georef import __version__
 from georef.evaluation.check_points import CheckPointReport, evaluate_check_points
 from georef.evaluation.forward_intersection import PosedImages
+from georef.geometry.camera import Camera
 from georef.geometry.rigid import Array, Rigid3
-from georef.io.files import write_text_atomically
+from georef.io.files import copy_atomically, write_text_atomically
 from georef.io.pose_records import PoseRecord, PosesFrame
 from georef.io.poses import write_poses
 from georef.report.build import ReportInput, build_report
 from georef.report.html import render_html
 from georef.report.plan import Placed
+from georef.report.text import render_text
 from georef.stages.adjusted_epoch import AdjustedEpoch, read_adjusted
 from georef.stages.base import StageContext, StageSummary
 from georef.stages.network import RESULT as NETWORK_RESULT
@@ -30,13 +32,15 @@ from georef.types.constraints import CheckKind
 from georef.types.results import Localized, Outcome, Rejected, with_estimated_cameras
 from georef.viewer.scene import Scene
 
-POSES, LOCALIZATION, REPORT, HTML, RECORDING = (
+POSES, LOCALIZATION, REPORT, HTML, RECORDING, TEXT = (
     "poses.csv",
     "localization.csv",
     "report.json",
     "report.html",
     "recording.rrd",
+    "adjustment.txt",
 )
+TABLES = "adjustment_*.csv"
 
 
 def run(context: StageContext) -> StageSummary:
@@ -52,6 +56,8 @@ def run(context: StageContext) -> StageSummary:
     report = build_report(_report_input(context, outcomes, adjusted))
     write_text_atomically(json.dumps(report, indent=1, allow_nan=False), folder / REPORT)
     write_text_atomically(render_html(report), folder / HTML)
+    write_text_atomically(render_text(report), folder / TEXT)
+    _copy_tables(Path(context.before["adjust"]), folder)
     if context.config.report.recording:
         from georef.viewer.recording import write_recording
 
@@ -59,10 +65,18 @@ def run(context: StageContext) -> StageSummary:
     return StageSummary(_line(report), _headline(report), 1, 1)
 
 
+def _copy_tables(adjusted: Path, folder: Path) -> None:
+    """The tables of the adjustment; those of an earlier one go."""
+    for old in folder.glob(TABLES):
+        old.unlink()
+    for table in adjusted.glob(TABLES):
+        copy_atomically(table, folder / table.name)
+
+
 def outputs_exist(context: StageContext) -> bool:
     """Whether all that is published is there, and of this very run (others may have been published since)."""
     folder = context.project.published(context.epoch)
-    names = (POSES, LOCALIZATION, HTML, *((RECORDING,) if context.config.report.recording else ()))
+    names = (POSES, LOCALIZATION, HTML, TEXT, *((RECORDING,) if context.config.report.recording else ()))
     if not all((folder / name).is_file() for name in names):
         return False
     path = folder / REPORT
@@ -166,9 +180,16 @@ def _posed_after_pnp(outcomes: Sequence[Outcome], survey: Survey, kind: CheckKin
 
 
 def _posed_adjusted(adjusted: AdjustedEpoch, survey: Survey, kind: CheckKind) -> PosedImages:
-    cameras = tuple(survey.epoch[name].camera for name in adjusted.image_ids)
+    estimated = {c["camera_id"]: _camera(c) for c in adjusted.data.get("calibrations", ())}
+    own = (survey.epoch[name].camera for name in adjusted.image_ids)
+    cameras = tuple(estimated.get(camera.camera_id, camera) for camera in own)
     joint = adjusted.joint if kind is CheckKind.ABSOLUTE else adjusted.relative_joint
     return PosedImages(adjusted.image_ids, cameras, adjusted.world_from_cams, joint)
+
+
+def _camera(data: dict[str, Any]) -> Camera:
+    """A camera as the adjustment estimated and stored it."""
+    return Camera(**{**data, "distortion": tuple(data["distortion"]), "estimate": tuple(data["estimate"])})
 
 
 def _axes_at_points(survey: Survey) -> dict[str, Array]:
@@ -188,7 +209,8 @@ def _placed(adjusted: AdjustedEpoch, survey: Survey) -> Placed:
         world=survey.world,
         new=dict(poses),
         position_covs=turned,
-        gnss_covs={image.image_id: image.gnss.cov for image in survey.epoch.images if image.gnss is not None},
+        gnss_covs={i.image_id: i.gnss.cov for i in survey.epoch.images if i.gnss is not None}
+        | {name: fix.cov for name, fix in survey.epoch.fixes.items()},
         reference={i.image_id: i.world_from_cam for i in survey.reference.images if i.world_from_cam is not None},
         check=survey.check,
         control=survey.control,

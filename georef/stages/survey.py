@@ -21,7 +21,7 @@ from georef.io.rig_table import read_rig
 from georef.io.tables import check_declared_crs, check_declared_height
 from georef.project import Project
 from georef.stages.cameras import CameraTable, Stated, unknown_camera, with_unknown
-from georef.stages.mountings import with_rig
+from georef.stages.mountings import with_fixes, with_rig
 from georef.stages.panoramas import CutOut, placeholder, with_heads
 from georef.stages.reference import image_files, read_orientations, reference_campaign, table_format, world_poses
 from georef.types.campaign import Campaign, Image, PositionPrior
@@ -29,6 +29,7 @@ from georef.types.constraints import CheckKind, CheckPoint, ControlPoint, Mark
 
 __all__ = ["Survey", "load_survey", "world_poses"]
 logger = logging.getLogger(__name__)
+_APPROXIMATE_M = 1000.0  # sigma of a coordinate of control that is approximate only
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,6 +115,8 @@ def _epoch(
             image = replace(image, camera=_new_camera(name, path, table, stated, section.unknown))
         images.append(replace(image, **priors.get(name, {})))
     campaign, cutouts = with_heads(project, epoch, images, section.panorama)
+    if gnss is not None:
+        campaign = with_fixes(campaign, gnss, section)
     if section.rig is None or gnss is None:
         return campaign, cutouts
     return with_rig(campaign, read_rig(project.data(section.rig)), gnss.path, project.data(section.rig)), cutouts
@@ -152,6 +155,7 @@ def _points(
         crs_kind=kind,
         columns=section.table.columns or None,
         table_format=table_format(section.table),
+        allow_partial=True,
     )
     check_frame(table, definition)
     marks = read_marks(project.data(section.marks[epoch]), repeats="mean", table_format=table_format(section.table))
@@ -160,14 +164,18 @@ def _points(
     for point, image, pixel, sigma in zip(marks.point_ids, marks.image_ids, marks.pixels, marks.sigmas_px, strict=True):
         by_point.setdefault(point, []).append(Mark(image, pixel, float(sigma)))
     positions = world.world_from_crs(table.positions_in_crs)
-    covs = np.zeros((len(table), 3, 3))
-    covs[:, range(3), range(3)] = np.square(table.sigmas_m)
+    known = np.isfinite(table.sigmas_m)
+    covs, information = np.zeros((len(table), 3, 3)), np.zeros((len(table), 3, 3))
+    covs[:, range(3), range(3)] = np.square(np.where(known, table.sigmas_m, _APPROXIMATE_M))
+    information[:, range(3), range(3)] = np.where(known, np.where(known, table.sigmas_m, 1.0) ** -2.0, 0.0)
     covs = world.world_cov_from_crs(table.positions_in_crs, covs)
+    information = world.world_cov_from_crs(table.positions_in_crs, information)
     control, check = [], []
     for index, name in enumerate(table.point_ids):
         own = tuple(by_point.get(name, ()))
         if table.roles[index] == "control":
-            control.append(ControlPoint(name, positions[index], covs[index], own))
+            partial = None if known[index].all() else information[index]
+            control.append(ControlPoint(name, positions[index], covs[index], own, partial))
         else:
             point_kind = table.kinds[index] or CheckKind(section.check_kind)
             check.append(CheckPoint(name, point_kind, positions[index], covs[index], own))

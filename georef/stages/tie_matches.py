@@ -67,8 +67,7 @@ class PairTask:
         keypoints = config.matching.max_keypoints
         posed = self._posed(a, keypoints), self._posed(b, keypoints)
         gate = config.localize.guided_gate
-        found = match_pair(posed, (a.pose_px, b.pose_px), self.localize.matcher, keypoints, gate)
-        return found
+        return match_pair(posed, (a.pose_px, b.pose_px), self.localize.matcher, keypoints, gate)
 
     @cached_property
     def _read(self):
@@ -100,7 +99,6 @@ class TieFiles:
                 continue
             parts = np.split(arrays["indices"], np.cumsum(header["counts"])[:-1])
             found.update(zip(header["keys"], parts, strict=True))
-        return found
 
     def add(self, key: str, indices: NDArray[np.int32]) -> None:
         self._pending[key] = indices

@@ -67,6 +67,7 @@ class Mounting:
     camera: str  # the id of a camera, or of a head
     rig_from_cam: Rigid3
     cov: Array | None = None  # (6, 6) right perturbation of rig_from_cam; None: exact
+    free: bool = False  # nobody states a sigma: estimated without a weight, cov being wide
 
     def __post_init__(self) -> None:
         if self.cov is not None:
@@ -77,12 +78,15 @@ class Mounting:
 class Campaign:
     """The images of one epoch, in the order of the table that lists them.
 
-    mountings: by image id, of images that belong to a station whose rig is known.
+    mountings: by image id, of images that belong to a station whose rig is known. fixes: positions as they were
+    measured, where those of the images allow for the way from antenna to camera or an offset; times_s: of exposure.
     """
 
     epoch: str
     images: tuple[Image, ...]
     mountings: Mapping[str, Mounting] = field(default_factory=dict)
+    fixes: Mapping[str, PositionPrior] = field(default_factory=dict)
+    times_s: Mapping[str, float] = field(default_factory=dict)
 
     def __getitem__(self, image_id: str) -> Image:
         return self._by_id[image_id]

@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from enum import StrEnum
 
+import numpy as np
+
 from georef.geometry.rigid import Array
 from georef.types.campaign import require_covariance
 
@@ -31,12 +33,22 @@ class Mark:
 
 @dataclass(frozen=True, eq=False)
 class ControlPoint:
-    """A point whose coordinates take part in the adjustment."""
+    """A point whose coordinates take part in the adjustment.
+
+    partial: (3, 3) information of rank 2 (horizontal) or 1 (height) where not all of them are known; the others are
+    approximate, and cov is wide along them.
+    """
 
     point_id: str
     point_in_world: Array  # (3,)
     cov: Array  # (3, 3)
     marks: tuple[Mark, ...]
+    partial: Array | None = None
+
+    @property
+    def information(self) -> Array:
+        """(3, 3), of rank 1 to 3."""
+        return np.asarray(np.linalg.inv(self.cov), dtype=np.float64) if self.partial is None else self.partial
 
     def __post_init__(self) -> None:
         require_covariance(self.cov, 3)

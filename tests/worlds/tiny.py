@@ -106,15 +106,17 @@ class TinyWorld:
     frame: WorldFrame
 
 
-def write_tiny_world(folder: Path, *, rendered: bool = True) -> TinyWorld:
+def write_tiny_world(folder: Path, *, rendered: bool = True, more: int = 0, local: bool = False) -> TinyWorld:
     """Writes all images, tables and project.toml into a folder, the same on every run.
 
-    rendered = False leaves the image files empty, which is enough for everything that reads tables alone.
+    rendered = False leaves the image files empty, which is enough for everything that reads tables alone. more: new
+    images beyond the three. local: coordinates of an engineering CRS, which are those of the world.
     """
     rng = np.random.default_rng(7)
-    frame = WorldFrame.create(CrsDefinition("EPSG:25832", "ellipsoidal"), ORIGIN)
+    definition = CrsDefinition("local", None) if local else CrsDefinition("EPSG:25832", "ellipsoidal")
+    frame = WorldFrame.create(definition, (0.0, 0.0, 0.0) if local else ORIGIN)
     reference = {f"r{i}.jpg": pose for i, pose in enumerate(_reference_poses())}
-    new = {f"n{i}.jpg": pose for i, pose in enumerate(_new_poses())}
+    new = {f"n{i}.jpg": pose for i, pose in enumerate([*_new_poses(), *_more_poses(more)])}
     textures = wall_textures() if rendered else []
     for name, poses in (("reference", reference), (EPOCH, new)):
         (folder / name).mkdir(parents=True, exist_ok=True)
@@ -130,6 +132,8 @@ def write_tiny_world(folder: Path, *, rendered: bool = True) -> TinyWorld:
     _write_orientation(folder / f"truth_{EPOCH}_eo.csv", new, frame)
     _write_gnss(folder / f"{EPOCH}_gnss.csv", new, frame, rng)
     _write_points(folder, new, frame, rng)
+    if local:
+        _make_local(folder)
     return TinyWorld(folder, new, frame)
 
 
@@ -200,6 +204,32 @@ def _reference_poses() -> list[Rigid3]:
 
 def _new_poses() -> list[Rigid3]:
     return [_pose(-6.0, -2.6, 3.3, 38, -5, 1), _pose(-1.0, -4.1, 3.6, 46, -3, -1), _pose(3.8, -6.0, 3.2, 50, -6, 2)]
+
+
+def _more_poses(count: int) -> list[Rigid3]:
+    """A walk to and fro before the walls, looking into their corner."""
+    k = np.arange(count)
+    x, y = -8.0 + 14.0 * k / max(count - 1, 1), -3.0 - 0.45 * k - 1.5 * (k % 2)
+    yaw = np.degrees(np.arctan2(9.0 - x, 10.0 - y)) + 4.0 * (k % 3 - 1)
+    return [_pose(x[i], y[i], 3.0 + 0.2 * (i % 4), yaw[i], -4.0, 1.0) for i in k]
+
+
+def _make_local(folder: Path) -> None:
+    """The tables and the project of the same numbers as coordinates x, y, z of an engineering CRS."""
+    for path in folder.glob("*.csv"):
+        text = path.read_text(encoding="utf-8").replace(_CRS_LINE, "# Local engineering CRS of the site, metres.")
+        for name, other in (
+            ("easting,northing,height", "x,y,z"),
+            ("sigma_e,sigma_n,sigma_h", "sigma_x,sigma_y,sigma_z"),
+        ):
+            text = text.replace(name, other)
+        path.write_text(text, encoding="utf-8")
+    lines = [
+        'horizontal = "local"' if line.startswith("horizontal") else line
+        for line in PROJECT_TOML.splitlines()
+        if not line.startswith(("height", "origin"))
+    ]
+    (folder / "project.toml").write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
 def _disturbed(poses: dict[str, Rigid3], rng: np.random.Generator) -> dict[str, Rigid3]:

@@ -86,6 +86,8 @@ def _mountings(exposures: Sequence[Exposure | None]) -> tuple[Indices, tuple[Rig
 def _rig_camera(name: str, mounting: Mounting | None) -> RigCamera:
     if mounting is None:
         return RigCamera(name, Rigid3.identity())
+    if mounting.free:
+        return RigCamera(name, mounting.rig_from_cam, np.zeros((6, 6)))
     information = None if mounting.cov is None else np.asarray(np.linalg.inv(mounting.cov), dtype=np.float64)
     return RigCamera(name, mounting.rig_from_cam, information)
 
@@ -136,12 +138,12 @@ def _reference_rays(gcps: AutomaticGcps) -> ReferenceRays | None:
 def _point_priors(problem: Problem) -> PointPriors:
     gcps, control = problem.gcps, problem.control
     surveyed = np.arange(len(problem.points), len(problem.points) + len(control))
-    covs = np.concatenate([gcps.cov, np.array([c.cov for c in control], dtype=np.float64).reshape(-1, 3, 3)])
+    of_control = np.array([c.information for c in control], dtype=np.float64).reshape(-1, 3, 3)
     kinds = [KINDS_OF_POINT.index("automatic")] * len(gcps) + [KINDS_OF_POINT.index("control")] * len(control)
     return PointPriors(
         np.concatenate([gcps.point, surveyed]),
         np.concatenate([gcps.position, np.array([c.point_in_world for c in control]).reshape(-1, 3)]),
-        np.asarray(np.linalg.inv(covs), dtype=np.float64),
+        np.concatenate([np.asarray(np.linalg.inv(gcps.cov), dtype=np.float64).reshape(-1, 3, 3), of_control]),
         np.array(kinds, dtype=np.int64),
         (*(f"gcp {i}" for i in range(len(gcps))), *(c.point_id for c in control)),
     )

@@ -2,7 +2,8 @@
 
 Internal reliability: the minimal detectable bias, found with a probability of 1 - beta0 by a test that rejects good
 observations with alpha0. External: what a bias of that size does to the adjusted coordinate itself. Baarda (1968):
-delta0 = 4.13 for alpha0 = 0.001 and beta0 = 0.20.
+delta0 = 4.13 for alpha0 = 0.001 and beta0 = 0.20. Correlated components have the numbers of Schaffrin (1997),
+"Reliability measures for correlated observations": those of the plain formula may be negative or above 1.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ from georef.geometry.rigid import Array
 
 ALPHA0, BETA0 = 0.001, 0.20
 DELTA0 = float(norm.ppf(1.0 - 0.5 * ALPHA0) + norm.ppf(1.0 - BETA0))
+NO_WEIGHT = 1e-9  # of the largest weight of a constraint: below it a coordinate has none
 _CHUNK = 50_000  # observations at a time
 _CHECKED = 0.01  # a redundancy number below it: next to nothing checks the observation
 
@@ -37,7 +39,7 @@ class Reliability:
     ids: tuple[str, ...]  # of points, stations (GNSS) or images (poses)
     place: Array  # (K, 3) in world, adjusted: of the point, the antenna or the projection centre
     residual: Array  # (K, m) estimated minus given
-    redundancy: Array  # (K, m) redundancy numbers, 0 to 1 for uncorrelated components
+    redundancy: Array  # (K, m) (P Qvv P)_ii / P_ii, 0 to 1: the redundancy number where components are uncorrelated
     w: Array  # (K, m) Baarda's w, of unit variance where all is well
     detectable: Array  # (K, m) minimal detectable bias
     effect: Array  # (K, m) how far it would move the adjusted position of the same observation, m
@@ -79,13 +81,14 @@ def _part(block: Block, state: State, test: TermTests, axes: Axes | None) -> Rel
     information = np.swapaxes(weight, 1, 2) @ weight
     checked = np.swapaxes(weight, 1, 2) @ test.cofactor @ weight  # P Qvv P
     power = _diagonal(checked)
-    weighted = _diagonal(information) > 0.0
+    given = _diagonal(information)
+    weighted = given > NO_WEIGHT * given.max(axis=1, keepdims=True, initial=0.0)
     # Qvv P in the observation's own units: W^-1 Qvv_w W, where rows without weight stay out.
     back = np.linalg.pinv(weight)
     redundant = back @ test.cofactor @ weight
-    redundancy = np.where(weighted, _diagonal(redundant), np.nan)
-    found = weighted & (redundancy > _CHECKED)
     with np.errstate(divide="ignore", invalid="ignore"):
+        redundancy = np.where(weighted, np.maximum(power, 0.0) / _diagonal(information), np.nan)
+        found = weighted & (redundancy > _CHECKED)
         sigma = np.sqrt(power)
         w = np.einsum("kji,kj->ki", weight, test.residual) / sigma
         bias = np.where(found, DELTA0 / sigma, np.where(weighted, np.inf, np.nan))
