@@ -99,6 +99,7 @@ class TieFiles:
                 continue
             parts = np.split(arrays["indices"], np.cumsum(header["counts"])[:-1])
             found.update(zip(header["keys"], parts, strict=True))
+        return found
 
     def add(self, key: str, indices: NDArray[np.int32]) -> None:
         self._pending[key] = indices
