@@ -20,6 +20,7 @@ from georef.io.files import write_text_atomically
 from georef.project import Project
 from georef.stages import (
     adjust,
+    adjusted_epoch,
     features,
     global_map,
     index,
@@ -216,7 +217,7 @@ def _results_exist(context: StageContext, stage: str) -> bool:
         "index": context.folder / index.VECTORS,
         "global-map": context.folder / global_map.STRUCTURE,
         "tracks": context.folder / global_map.STRUCTURE,
-        "adjust": context.folder / adjust.RESULT,
+        "adjust": context.folder / adjusted_epoch.RESULT,
     }
     checks = {"localize": localize.outcomes_exist, "stations": localize.outcomes_exist, "report": report.outputs_exist}
     return checks[stage](context) if stage in checks else stage not in left or left[stage].exists()

@@ -72,7 +72,7 @@ def match_pair(
     matcher: Matcher,
     keypoints: int,
     gate: float,
-) -> NDArray[np.integer]:
+) -> NDArray[np.int32]:
     """Matches (n, 2) of two new images, the strongest keypoints of each, near each other's epipolar lines.
 
     `gate` is the largest distance, in keypoint scales combined with `pose_px`, what the uncertainty of the poses
@@ -82,7 +82,7 @@ def match_pair(
     found = matcher.match(a.features.head(keypoints), b.features.head(keypoints)).indices
     scales = np.column_stack([a.features.scales_px[found[:, 0]], b.features.scales_px[found[:, 1]]])
     allowed = gate * np.hypot(scales, np.hypot(*pose_px))
-    found = found[(epipolar_distances(a, b, found) <= allowed).all(axis=1)]
+    found = found[(epipolar_distances(a, b, found) <= allowed).all(axis=1)].astype(np.int32)
     return found if len(found) >= _LEAST_PAIR_MATCHES else found[:0]
 
 

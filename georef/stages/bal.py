@@ -9,9 +9,11 @@ from pathlib import Path
 import numpy as np
 
 from georef.estimation.adjustment.block import Block, Calibration, RigCamera
+from georef.estimation.adjustment.checkpoints import Resumable
 from georef.estimation.adjustment.solver import Iteration, SolverOptions, solve_block
 from georef.geometry.rigid import Rigid3
 from georef.io.bal import BalProblem, read_bal, write_bal
+from georef.stages.solve_files import SolveFiles
 from georef.types.scene import Observations
 
 _OPTIONS = SolverOptions(max_iterations=200, damping=1e-4, cost_tolerance=1e-8, free_gauge=True)
@@ -40,7 +42,8 @@ class BalRun:
 
 
 def run_bal(path: Path, output: Path | None, say: Callable[[str], None] = lambda _: None) -> BalRun:
-    """Adjusts a problem and, where an output folder is named, writes it there. Raises InputError, GeorefError."""
+    """Adjusts a problem and, where an output folder is named, writes it there: what is interrupted then goes on from
+    its last iteration. Raises InputError, GeorefError."""
     problem = read_bal(path)
     block = block_of_bal(problem)
     start = block.start()
@@ -49,12 +52,16 @@ def run_bal(path: Path, output: Path | None, say: Callable[[str], None] = lambda
     def told(iteration: Iteration) -> None:
         say(f"iteration {iteration.number}: cost {iteration.cost:.6g}")
 
-    solution = solve_block(block, options=_OPTIONS, start=start, on_iteration=told)
+    files = None if output is None else SolveFiles(output / f"{path.name}.solves")
+    solve = solve_block if files is None else Resumable(files)
+    solution = solve(block, options=_OPTIONS, start=start, on_iteration=told)
     state = solution.state
     adjusted = problem.with_values(state.world_from_rig, state.cameras, state.points)
     written = None if output is None else output / path.name
     if written is not None:
         write_bal(adjusted, written)
+    if files is not None:
+        files.clear()
     return BalRun(adjusted, first, solution.cost, solution.iterations, solution.converged, written)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -28,7 +29,7 @@ from georef.stages.network import read_noise
 from georef.stages.turned import TurnableImage
 from georef.types.campaign import Campaign, Image
 from georef.types.features import Features
-from georef.types.results import Localized, Outcome, ReferenceNoise, Rejected, RejectReason
+from georef.types.results import Outcome, ReferenceNoise, Rejected, RejectReason
 from georef.types.scene import ImageStructure
 
 ITEMS, STRUCTURE = "items", "structure"
@@ -157,23 +158,28 @@ def outcomes_exist(context: StageContext) -> bool:
     return all(item_path(items, image.image_id).is_file() for image in context.survey.epoch.images)
 
 
-def read_outcomes(folder: Path, epoch: Campaign, items: str = ITEMS) -> list[Outcome]:
-    """The outcomes of all images of an epoch, in its order."""
-    return [read_outcome(item_path(folder / items, image.image_id)) for image in epoch.images]
+def read_outcomes(folder: Path, epoch: Campaign, items: str = ITEMS) -> Iterator[Outcome]:
+    """The outcomes of all images of an epoch, in its order, one by one."""
+    return (read_outcome(item_path(folder / items, image.image_id)) for image in epoch.images)
 
 
-def summary_of(outcomes: list[Outcome], computed: int) -> StageSummary:
-    """Outcomes in a line, and in figures."""
-    localized = [o for o in outcomes if isinstance(o, Localized)]
-    rejected = Counter(o.reason.value for o in outcomes if isinstance(o, Rejected))
-    line = f"{len(localized)} of {len(outcomes)} images localized"
+def summary_of(outcomes: Iterable[Outcome], computed: int) -> StageSummary:
+    """Outcomes in a line, and in figures; none is kept."""
+    rejected: Counter[str] = Counter()
+    localized: list[tuple[float, int]] = []  # sigma in metres, correspondences
+    for o in outcomes:
+        if isinstance(o, Rejected):
+            rejected[o.reason.value] += 1
+        else:
+            localized.append((float(np.sqrt(np.trace(o.world_from_cam_cov[3:, 3:]))), o.correspondence_count))
+    total = len(localized) + rejected.total()
+    line = f"{len(localized)} of {total} images localized"
     if localized:
-        sigmas = [float(np.sqrt(np.trace(o.world_from_cam_cov[3:, 3:]))) for o in localized]
-        counts = [o.correspondence_count for o in localized]
-        line += f", median sigma {1e3 * np.median(sigmas):.1f} mm, {np.median(counts):.0f} correspondences"
+        sigma, count = np.median(localized, axis=0)
+        line += f", median sigma {1e3 * sigma:.1f} mm, {count:.0f} correspondences"
     if rejected:
         line += "; rejected: " + ", ".join(f"{count} {reason}" for reason, count in rejected.items())
-    return StageSummary(line, {"localized": len(localized), "rejected": dict(rejected)}, computed, len(outcomes))
+    return StageSummary(line, {"localized": len(localized), "rejected": dict(rejected)}, computed, total)
 
 
 def matcher_version(config: Config) -> str:

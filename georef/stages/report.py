@@ -23,7 +23,7 @@ from georef.report.build import ReportInput, build_report
 from georef.report.html import render_html
 from georef.report.plan import Placed
 from georef.report.text import render_text
-from georef.stages.adjust import AdjustedEpoch, read_adjusted
+from georef.stages.adjusted_epoch import AdjustedEpoch, read_adjusted
 from georef.stages.base import StageContext, StageSummary
 from georef.stages.network import RESULT as NETWORK_RESULT
 from georef.stages.stations import final_outcomes
@@ -46,7 +46,7 @@ TABLES = "adjustment_*.csv"
 def run(context: StageContext) -> StageSummary:
     """Publishes the epoch: poses before and after the adjustment, the report, the recording."""
     folder = context.project.published(context.epoch)
-    outcomes = final_outcomes(context)
+    outcomes = list(final_outcomes(context))
     survey = replace(context.survey, epoch=with_estimated_cameras(context.survey.epoch, outcomes))
     context = replace(context, survey=survey)
     adjusted = read_adjusted(context.before["adjust"])

@@ -28,10 +28,14 @@ def wanted(config: Config, survey: Survey) -> bool:
     return together == "sequence" or (together == "station" and bool(survey.epoch.mountings))
 
 
-def final_outcomes(context: StageContext) -> list[Outcome]:
-    """The outcome of every image before the adjustment: of its station where stations are posed, else its own."""
-    folder = context.before.get("stations", context.before["localize"])
-    return read_outcomes(folder, context.survey.epoch)
+def final_results(context: StageContext) -> Path:
+    """The folder of the stage that posed images last before the adjustment: stations where wanted, else localize."""
+    return context.before.get("stations", context.before["localize"])
+
+
+def final_outcomes(context: StageContext) -> Iterator[Outcome]:
+    """The outcome of every image before the adjustment, in the order of the epoch, one by one."""
+    return read_outcomes(final_results(context), context.survey.epoch)
 
 
 def groups_of(epoch: Campaign) -> list[list[Image]]:
@@ -62,7 +66,7 @@ def run(context: StageContext) -> StageSummary:
         task.ties = dict(context.executor.map_items(TieTask(task), pairs, "tie points"))
         for outcomes in context.executor.map_items(WindowTask(task), pending, "sequences"):
             _write(last, outcomes)
-    return _summary(alone, read_outcomes(context.folder, epoch), groups, computed)
+    return _summary(alone, list(read_outcomes(context.folder, epoch)), groups, computed)
 
 
 def _store(context: StageContext, task: StationTask, groups: list[list[Image]], folder: Path) -> int:

@@ -67,8 +67,7 @@ class PairTask:
         keypoints = config.matching.max_keypoints
         posed = self._posed(a, keypoints), self._posed(b, keypoints)
         gate = config.localize.guided_gate
-        found = match_pair(posed, (a.pose_px, b.pose_px), self.localize.matcher, keypoints, gate)
-        return found.astype(np.int32)
+        return match_pair(posed, (a.pose_px, b.pose_px), self.localize.matcher, keypoints, gate)
 
     @cached_property
     def _read(self):

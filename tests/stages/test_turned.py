@@ -12,7 +12,7 @@ from PIL import Image as Picture
 
 from georef.features.images import read_image, turned
 from georef.geometry.rigid import Rigid3, exp_so3
-from georef.stages.adjust import read_adjusted
+from georef.stages.adjusted_epoch import read_adjusted
 from georef.stages.base import feature_id, open_features
 from georef.stages.localize import read_outcomes
 from georef.types.results import Localized

@@ -20,7 +20,10 @@ from georef.estimation.adjustment.block import Block, State
 from georef.estimation.adjustment.checkpoints import Reached, Resumable, digest_of
 from georef.estimation.adjustment.solver import BlockSolution, SolverOptions, solve_block
 from georef.geometry.poses import Poses
+from georef.io.bal import BalProblem, write_bal
+from georef.stages.bal import run_bal
 from georef.stages.solve_files import SolveFiles
+from tests.unit.test_io_bal import _problem as bal_problem
 from tests.worlds.rig_blocks import rig_block
 
 _KILLED = """
@@ -28,7 +31,10 @@ import os, signal, sys
 from pathlib import Path
 from georef.estimation.adjustment.adjust_block import BlockOptions, adjust_block
 from georef.estimation.adjustment.checkpoints import Resumable
+from georef.io.bal import BalProblem, write_bal
+from georef.stages.bal import run_bal
 from georef.stages.solve_files import SolveFiles
+from tests.unit.test_io_bal import _problem as bal_problem
 from tests.worlds.rig_blocks import rig_block
 
 class Killing(SolveFiles):
@@ -156,3 +162,32 @@ def test_digests_tell_data_apart() -> None:
     assert digest_of(np.zeros((2, 3))) != digest_of(np.zeros((3, 2)))
     with pytest.raises(TypeError, match="object has no digest"):
         digest_of(object())
+
+
+def test_an_interrupted_problem_file_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path, output = tmp_path / "p.txt", tmp_path / "out"
+    write_bal(_moved(bal_problem()), path)
+    expected = run_bal(path, None)
+    assert expected.iterations > 4
+    seen: list[str] = []
+    with monkeypatch.context() as patched:
+        written = SolveFiles.write
+
+        def write(self: SolveFiles, key: str, reached: Reached) -> None:
+            written(self, key, reached)
+            if reached.solution.iterations == 2:
+                raise _Killed
+
+        patched.setattr(SolveFiles, "write", write)
+        with pytest.raises(_Killed):
+            run_bal(path, output)
+    done = run_bal(path, output, seen.append)
+    assert seen[0].startswith("iteration 3:")
+    assert done.iterations == expected.iterations
+    assert done.cost == pytest.approx(expected.cost, rel=1e-9)
+    assert [file.name for file in output.iterdir()] == ["p.txt"]
+
+
+def _moved(problem: BalProblem) -> BalProblem:
+    """With points that are off, so that there is something to do."""
+    return replace(problem, points=problem.points + np.random.default_rng(1).normal(size=problem.points.shape) * 0.2)

@@ -84,3 +84,30 @@ def test_a_fault_of_our_own_is_raised_after_the_results_before_it(workers: int) 
         taken.extend(results)
     assert taken == [0, 1]
     assert progress.seen[-1] == "end"
+
+
+@dataclass
+class Kept:
+    """Something that stays where it was made, and counts how often it was asked."""
+
+    value: int
+    asked: int = 0
+
+    def add(self, number: int) -> tuple[int, int, int]:
+        self.asked += 1
+        return self.value + number, self.asked, os.getpid()
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_what_is_held_keeps_its_state_between_calls(workers: int) -> None:
+    with Executor(workers=workers).held() as held:
+        held.put(Kept, iter([10, 20, 30]))
+        first = held.call(Kept.add, [1, 2, 3])
+        second = held.call(Kept.add, [4, 5, 6])
+        assert [result[:2] for result in first] == [(11, 1), (22, 1), (33, 1)]
+        assert [result[:2] for result in second] == [(14, 2), (25, 2), (36, 2)]
+        assert [result[2] for result in first] == [result[2] for result in second]
+        assert len({result[2] for result in first}) == workers
+        assert (os.getpid() in {result[2] for result in first}) == (workers == 1)
+        held.put(Kept, [7])
+        assert held.call(Kept.add, [1])[0][:2] == (8, 1)

@@ -69,6 +69,7 @@ class Standing:
     def start(self, block: Block) -> State:
         """Approximate values of a block: what stands where it is known, else its own; points are its own."""
         start = block.start()
+        start = replace(start, world_from_rig=start.world_from_rig.take(np.arange(len(block.station_ids))))
         old, new = _common(self.station_ids, block.station_ids)
         start.world_from_rig.rotation[new] = self.world_from_rig.rotation[old]
         start.world_from_rig.translation[new] = self.world_from_rig.translation[old]
