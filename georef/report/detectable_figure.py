@@ -13,12 +13,20 @@ from georef.report.svg import Drawing, round_down, round_up, short
 from georef.report.wording import GROUPS
 
 _LARGEST, _SMALLEST = 9.0, 0.8  # radius of a disc in figure units
+_FEWEST, _ALIKE = 4, 1.1
 _STEPS = 5  # sizes of discs, so that thousands are a few elements
 
 
 def detectable_figures(groups: Mapping[str, Any], axes: Sequence[str]) -> list[Markup]:
-    """One plan for each group that has members in it."""
-    return [_figure(GROUPS.get(key, key), group["in_plan"], axes) for key, group in groups.items() if group["in_plan"]]
+    """One plan for each group whose members differ."""
+    shown = {key: group["in_plan"] for key, group in groups.items() if _worth_showing(group["in_plan"])}
+    return [_figure(GROUPS.get(key, key), members, axes) for key, members in shown.items()]
+
+
+def _worth_showing(members: Sequence[Mapping[str, Any]]) -> bool:
+    values = [member["detectable_m"] for member in members]
+    known = [value for value in values if value is not None]
+    return len(members) >= _FEWEST and (len(known) < len(values) or max(known) > _ALIKE * min(known))
 
 
 def _figure(name: str, members: Sequence[Mapping[str, Any]], axes: Sequence[str]) -> Markup:

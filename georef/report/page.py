@@ -10,6 +10,7 @@ import numpy as np
 from georef.report.wording import BRIEF, GROUPS, MEANING, REASONS, attention, component_reading, nees_verdict
 
 MOST_ROWS = 400
+_MOST_REJECTED = 15  # of a group
 _STAGES = {
     "features": "Features",
     "network": "Reference network",
@@ -119,9 +120,9 @@ def _reliability(section: Mapping[str, Any]) -> dict[str, Any]:
         {"key": key, "name": GROUPS.get(key, key), **group, "ranges": _ranges(group)}
         for key, group in section.get("groups", {}).items()
     ]
-    rejected = [
-        {**one, "group": GROUPS.get(one["kind"], one["kind"])} for one in section.get("rejected_constraints", ())
-    ]
+    listed = section.get("rejected_constraints", ())
+    kinds = dict.fromkeys(one["kind"] for one in listed)
+    rejected = [one for kind in kinds for one in [r for r in listed if r["kind"] == kind][:_MOST_REJECTED]]
     return {
         "groups": groups,
         "rejected": [{**one, "group": GROUPS.get(one["kind"], one["kind"])} for one in rejected],

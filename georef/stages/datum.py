@@ -117,7 +117,7 @@ def _plain(source: _Source, report: DatumReport, accepted: Sequence[str]) -> dic
         "source": source.name,
         "pairs": report.pairs,
         "outliers": report.outliers,
-        "blind_to": list(report.blind_to),
+        "blind_to": [what for what in report.blind_to if source.name == GNSS or "headings" not in what],
         "findings": [
             {
                 "kind": finding.kind,

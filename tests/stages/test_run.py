@@ -141,7 +141,8 @@ def test_the_command_says_a_line_a_stage_and_where_results_are(
     of_stages, of_files = lines[: len(STAGES)], lines[len(STAGES) :]
     assert [line.split()[0] for line in of_stages] == STAGES
     assert all(line.endswith("[kept]") for line in of_stages)
-    assert [line.split()[0] for line in of_files] == ["poses.csv", "localization.csv", "report.html", "report.json"]
+    names = ["poses.csv", "localization.csv", "report.html", "report.json", "adjustment.txt"]
+    assert [line.split()[0] for line in of_files] == names
     assert all(Path(line.split()[-1]).is_file() for line in of_files)
 
 

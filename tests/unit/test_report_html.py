@@ -289,3 +289,45 @@ def text(page: str) -> str:
     bare = re.sub(r"<(style|svg).*?</\1>", " ", page, flags=re.DOTALL)
     bare = re.sub(r"<[^>]*>", " ", bare).replace("&nbsp;", " ")
     return re.sub(r"[ \n\t]+", " ", bare)
+
+
+def test_reliability_is_shown_and_a_report_without_it_still_is() -> None:
+    ranges = {"least": 0.01, "median": 0.02, "p95": 0.05, "greatest": None}
+    members = [
+        {"name": f"gcp {i}", "position_m": [500.0 + i, 800.0, 1.0], "detectable_m": 0.01 * i} for i in range(1, 9)
+    ]
+    unchecked = {"name": "gcp 9", "position_m": [509.0, 801.0, 1.0], "detectable_m": None}
+    group = {
+        "count": 9,
+        "unchecked": 1,
+        "largest_w": {"name": "gcp 3", "axis": "n", "w": -3.1},
+        **{part: dict.fromkeys("enh", ranges) for part in ("redundancy", "detectable_m", "effect_m")},
+        "weakest": [{"name": "gcp 9"}],
+        "in_plan": [*members, unchecked],
+    }
+    section = {
+        "redundancy": {"observations": 900, "unknowns": 500, "redundancy": 400.0, "sigma0": 1.02}
+        | {"image_redundancy_number": {"median": 0.6, "unchecked": 0.0}},
+        "groups": {"automatic_gcps": group},
+        "rejected_constraints": [
+            {"kind": "gnss", "name": "station 7", "statistic": 41.5, "dof": 3},
+            *({"kind": "automatic_gcps", "name": f"bad {i}", "statistic": 30.0, "dof": 2} for i in range(40)),
+        ],
+        "shared_unknowns": [{"name": "focal of left", "value": 1500.25, "sigma": 0.31, "unit": "px"}],
+        "correlations": [{"first": "focal of left", "second": "distance of left", "value": 0.987}],
+        "correlations_in_all": 1,
+        "weak_focals": [{"text": "The focal length of camera 'left' is weak: \nhold it."}],
+    }
+    page = render_html(report([localized("a.jpg")], RELATIVE, reliability=section))
+    said = text(page)
+    words = ("redundancy 400", "1.020", "station 7 41.5 3", "focal of left 1 500.25000", "0.9870", "gcp 9", "-3.1")
+    plain = said.replace("\N{NARROW NO-BREAK SPACE}", " ").replace("\N{MINUS SIGN}", "-")
+    assert [word for word in words if word not in plain] == []
+    assert "bad 14" in said
+    assert "bad 15" not in said
+    assert page.count('class="detectable"') >= 8
+    assert page.count('class="unchecked"') == 1
+    warnings = attention(report([localized("a.jpg")], RELATIVE, reliability=section))
+    assert any("is weak" in line for line in warnings)
+    assert any("+0.987" in line for line in warnings)
+    assert "Reliability" not in text(render_html(report([localized("a.jpg")], RELATIVE)))
