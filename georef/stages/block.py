@@ -36,6 +36,7 @@ from georef.stages.block_files import write_block_cameras, write_block_poses
 from georef.stages.block_hold_out import hold_out_numbers
 from georef.stages.block_numbers import named, partial_check_numbers, rejected_numbers, variant_numbers
 from georef.stages.block_pictures import picture_numbers
+from georef.stages.block_state import block_inputs
 from georef.stages.block_survey import BlockSurvey, load_block
 from georef.stages.block_words import text_of
 from georef.types.constraints import CheckPoint, ControlPoint
@@ -73,6 +74,7 @@ def run(project: Project, name: str, say: Say = lambda _: None) -> BlockRun:
         "project": project.file.name,
         "block": name,
         "crs": survey.world.describe(),
+        "inputs": block_inputs(project, name),
         "data": _data(survey, cleaned),
         "rejected": [rejected_numbers(named(entry, survey.tie_ids)) for entry in cleaned.rejected],
         "variants": {title: _variant(survey, cleaned, found) for title, found in solutions.items()},
