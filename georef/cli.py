@@ -154,6 +154,13 @@ def status(
     from georef.pipeline import status as stage_states
 
     opened = place.open(project, choice.preset, choice.set_)
+    for block in opened.file.blocks if epoch is None else ():
+        from georef.stages.block_state import block_state
+
+        state, why = block_state(opened, block)
+        say(f"project {opened.file.name}, block {block}, results in {opened.output}", f"{state:<8} {why}")
+    if not opened.file.epochs:
+        return 0
     name = opened.select_epoch(epoch)
     say(f"project {opened.file.name}, epoch {name}, results in {opened.output}", "")
     say(f"{'stage':<9} {'state':<8} why or what", f"{'-' * 9} {'-' * 8} {'-' * 40}")

@@ -19,6 +19,7 @@ from georef.estimation.adjustment.block_correlations import (
     shared_unknowns,
     strong_correlations,
 )
+from georef.estimation.adjustment.block_quality import CONTROL
 from georef.estimation.adjustment.block_solutions import (
     CleanBlock,
     Solved,
@@ -30,12 +31,14 @@ from georef.estimation.adjustment.block_solutions import (
 from georef.io.files import write_text_atomically
 from georef.project import Project
 from georef.report.block_page import render_block
+from georef.sections import HoldOut
 from georef.stages.base import Meter
 from georef.stages.block_comparison import comparisons
 from georef.stages.block_files import write_block_cameras, write_block_poses
 from georef.stages.block_hold_out import hold_out_numbers
 from georef.stages.block_numbers import named, partial_check_numbers, rejected_numbers, variant_numbers
 from georef.stages.block_pictures import picture_numbers
+from georef.stages.block_state import block_inputs
 from georef.stages.block_survey import BlockSurvey, load_block
 from georef.stages.block_words import text_of
 from georef.types.constraints import CheckPoint, ControlPoint
@@ -73,6 +76,7 @@ def run(project: Project, name: str, say: Say = lambda _: None) -> BlockRun:
         "project": project.file.name,
         "block": name,
         "crs": survey.world.describe(),
+        "inputs": block_inputs(project, name),
         "data": _data(survey, cleaned),
         "rejected": [rejected_numbers(named(entry, survey.tie_ids)) for entry in cleaned.rejected],
         "variants": {title: _variant(survey, cleaned, found) for title, found in solutions.items()},
@@ -80,10 +84,7 @@ def run(project: Project, name: str, say: Say = lambda _: None) -> BlockRun:
     if survey.surveyed and survey.has_gnss and len(survey.block.drift_information) <= 1:
         say("offset between GNSS and surveyed points")
         report["offset"] = _offset(survey, cleaned, config, solutions)
-    if section.hold_out is not None and section.hold_out.control < len(survey.whole):
-        say("splits into control and check points")
-        free = solutions["no control" if survey.declared_control else "as declared"] if survey.has_gnss else None
-        report["hold_out"] = hold_out_numbers(survey, cleaned, config, section.hold_out, free)
+    report["hold_outs"] = _hold_outs(survey, cleaned, config, section.hold_out, solutions, say)
     if section.compare is not None:
         report["comparisons"] = comparisons(project, section.compare, final)
     report["figures"] = picture_numbers(survey, final, solutions.get("all control"))
@@ -102,6 +103,32 @@ def _other_controls(survey: BlockSurvey) -> dict[str, tuple[str, ...]]:
     out: dict[str, tuple[str, ...]] = {"no control": ()} if every and survey.has_gnss else {}
     out |= {"all control": every} if every else {}
     return {title: control for title, control in out.items() if set(control) != set(survey.declared_control)}
+
+
+def _wrong(solutions: Mapping[str, Solved]) -> list[str]:
+    """Points that contradict the others where they are control."""
+    return sorted({entry.name for found in solutions.values() for entry in found.rejected if entry.kind == CONTROL})
+
+
+def _hold_outs(
+    survey: BlockSurvey,
+    cleaned: CleanBlock,
+    config: AdjustConfig,
+    asked: HoldOut | None,
+    solutions: Mapping[str, Solved],
+    say: Say,
+) -> list[dict[str, Any]]:
+    """Splits of all points and, where some contradict the others, of those that do not as well."""
+    if asked is None or asked.control >= len(survey.whole):
+        return []
+    say("splits into control and check points")
+    free = solutions["no control" if survey.declared_control else "as declared"] if survey.has_gnss else None
+    wrong = _wrong(solutions)
+    out = [hold_out_numbers(survey, cleaned, config, asked, free)]
+    left = [point for point in survey.whole if point.point_id not in wrong]
+    if wrong and asked.control < len(left):
+        out.append(hold_out_numbers(survey, cleaned, config, asked, free, tuple(wrong)))
+    return out
 
 
 def _variant(survey: BlockSurvey, cleaned: CleanBlock, found: Solved) -> dict[str, Any]:
@@ -136,7 +163,7 @@ def _offset(
 ) -> dict[str, Any]:
     """The offset of a block that GNSS alone holds from all surveyed points, none of which takes part; without those
     that contradict the others where they are control."""
-    wrong = {entry.name for found in solutions.values() for entry in found.rejected if entry.kind == "control"}
+    wrong = _wrong(solutions)
     points = [point for point in survey.check(()) if point.point_id not in wrong]
     start = replace(cleaned.state, drift_m=np.zeros((0, 3)))
     found = solved(without_offset(cleaned.block), start, points, config)
@@ -151,7 +178,7 @@ def _offset(
         "left_over": offset.left_over,
         "mean_difference_m": np.mean([e.difference_m for e in found.check.errors.determined], axis=0).tolist(),
         "points": len(found.check.errors.determined),
-        "left_out": sorted(wrong),
+        "left_out": wrong,
         "shared_unknowns": [asdict(unknown) for unknown in shared_unknowns(found)],
         "height_correlations": [asdict(c) for c in height],
         "correlations": [asdict(c) for c in strong_correlations(found)],

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from georef.config import AdjustConfig
-from georef.estimation.adjustment.block_check import with_points_as_control
+from georef.estimation.adjustment.block_check import BlockCheck, with_points_as_control
 from georef.estimation.adjustment.block_solutions import CleanBlock, Solved, solved, start_with, with_control
 from georef.evaluation.check_points import CheckPointErrors
 from georef.evaluation.splits import spread_splits
@@ -19,28 +20,38 @@ from georef.stages.block_survey import BlockSurvey
 
 
 def hold_out_numbers(
-    survey: BlockSurvey, cleaned: CleanBlock, config: AdjustConfig, hold_out: HoldOut, free: Solved | None
+    survey: BlockSurvey,
+    cleaned: CleanBlock,
+    config: AdjustConfig,
+    hold_out: HoldOut,
+    free: Solved | None,
+    left_out: tuple[str, ...] = (),
 ) -> dict[str, Any]:
-    """The splits and their medians. free: the solution without control, where GNSS holds the datum.
+    """The splits and their medians. free: the solution without control, where GNSS holds the datum; left_out: points
+    that take no part.
 
     Where GNSS holds the datum, one solution without control tells how all surveyed points and the block hang together,
     and so what each choice of control does; the first split is adjusted as well, and the report says how far the two
     differ. Without GNSS each split is adjusted. No split passes gates: none of its check points may be told by results.
     """
     positions = {point.point_id: point.point_in_world[:2] for point in survey.surveyed}
-    names = [point.point_id for point in survey.whole if len(point.marks) >= 2]
     if free is not None:
         names = [error.point_id for error in free.check.errors.determined]
+    else:
+        names = [point.point_id for point in survey.whole if len(point.marks) >= 2]
+    names = [name for name in names if name not in left_out]
     chosen = spread_splits(np.array([positions[name] for name in names]), hold_out.control, hold_out.count)
     controls = [[names[i] for i in split] for split in chosen]
     if free is not None:
-        errors = [with_points_as_control(free.check, split) for split in chosen]
+        known = _without(free.check, left_out)
+        errors = [with_points_as_control(known, split) for split in chosen]
     else:
-        errors = [_adjusted(survey, cleaned, config, control).check.errors for control in controls]
+        errors = [_adjusted(survey, cleaned, config, control, left_out) for control in controls]
     splits = [_split_result(*pair) for pair in zip(errors, controls, strict=True)]
-    again = _adjusted(survey, cleaned, config, controls[0]).check.errors if free is not None else errors[0]
+    again = _adjusted(survey, cleaned, config, controls[0], left_out) if free is not None else errors[0]
     values = [value for split in splits for value in split["nees"]]
     return {
+        "left_out": list(left_out),
         "splits": splits,
         "median_rmse_m": np.median([split["rmse_m"] for split in splits], axis=0).tolist(),
         "largest_rmse_m": np.max([split["rmse_m"] for split in splits], axis=0).tolist(),
@@ -49,10 +60,27 @@ def hold_out_numbers(
     }
 
 
-def _adjusted(survey: BlockSurvey, cleaned: CleanBlock, config: AdjustConfig, names: list[str]) -> Solved:
+def _without(check: BlockCheck, names: tuple[str, ...]) -> BlockCheck:
+    """The differences of the points that are not named."""
+    errors, joint = check.errors, check.errors.joint_cov
+    kept = [i for i, error in enumerate(errors.determined) if error.point_id not in names]
+    rows = np.array([3 * i + k for i in kept for k in range(3)], dtype=np.int64)
+    part = CheckPointErrors(
+        tuple(errors.determined[i] for i in kept),
+        errors.not_determined,
+        None if joint is None else joint[np.ix_(rows, rows)],
+    )
+    return replace(check, errors=part)
+
+
+def _adjusted(
+    survey: BlockSurvey, cleaned: CleanBlock, config: AdjustConfig, names: list[str], left_out: tuple[str, ...]
+) -> CheckPointErrors:
+    """What the check points of a split say of its adjustment."""
     control = survey.control(names)
     block, start = with_control(cleaned.block, control), start_with(cleaned.state, control)
-    return solved(block, start, survey.check(names), config)
+    check = [point for point in survey.check(names) if point.point_id not in left_out]
+    return solved(block, start, check, config).check.errors
 
 
 def _differences(errors: CheckPointErrors) -> Array:

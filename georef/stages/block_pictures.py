@@ -16,7 +16,7 @@ _ACROSS = 12  # cells over the width of an image
 
 
 def picture_numbers(survey: BlockSurvey, declared: Solved, every: Solved | None) -> dict[str, Any]:
-    """plan: stations with residuals of GNSS and covariances, points of the declared solution and of that with all control.
+    """plan: stations with residuals of GNSS and covariances, points of the declared solution and with all control.
 
     images: mean residuals in cells of the image plane of each camera.
     """
@@ -30,7 +30,7 @@ def _plan(survey: BlockSurvey, declared: Solved, every: Solved | None) -> dict[s
     rotation = state.world_from_rig.rotation[shown]
     covs = rotation @ declared.cofactors.stations[shown][:, 3:, 3:] @ np.swapaxes(rotation, 1, 2)
     off = _gnss_residuals(declared)
-    places = state.world_from_rig.translation
+    places, given = state.world_from_rig.translation, {p.point_id: p.point_in_world for p in survey.surveyed}
     return {
         "stations": count,
         "shown": [
@@ -46,8 +46,7 @@ def _plan(survey: BlockSurvey, declared: Solved, every: Solved | None) -> dict[s
         "control": _control(declared),
         "all_control": [] if every is None else _control(every),
         "check": [
-            {"point_id": e.point_id, "position_m": _short(places_of[e.point_id]), "residual_m": _short(e.difference_m)}
-            for places_of in [{p.point_id: p.point_in_world for p in survey.surveyed}]
+            {"point_id": e.point_id, "position_m": _short(given[e.point_id]), "residual_m": _short(e.difference_m)}
             for e in declared.check.errors.determined
         ],
     }

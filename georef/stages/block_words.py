@@ -26,8 +26,8 @@ def text_of(report: dict[str, Any]) -> list[str]:
         lines += ["", *variant_lines(title, variant)]
     if report.get("offset"):
         lines += ["", *_offset_lines(report["offset"])]
-    if "hold_out" in report:
-        lines += ["", *_hold_out_lines(report["hold_out"])]
+    for hold_out in report["hold_outs"]:
+        lines += ["", *_hold_out_lines(hold_out)]
     for comparison in report.get("comparisons", []):
         lines += ["", *_comparison_lines(comparison)]
     return lines
@@ -36,8 +36,9 @@ def text_of(report: dict[str, Any]) -> list[str]:
 def _offset_lines(offset: dict[str, Any]) -> list[str]:
     significant = offset["statistic"] > _SIGNIFICANT
     what = "significant" if significant else "not significant"
+    without = f", without {', '.join(offset['left_out'])}, which contradict the others" if offset["left_out"] else ""
     return [
-        f"GNSS alone against {offset['points']} surveyed points, no control:",
+        f"GNSS alone against {offset['points']} surveyed points, no control{without}:",
         f"  offset, block less surveyed points E/N/H {cm(offset['offset_m'])}, 1-sigma {cm(offset['sigma_m'])}",
         f"  {what}: chi-square {offset['statistic']:.1f} of 3 degrees of freedom (99.9 %: {_SIGNIFICANT:.1f}); "
         f"what is left over the offset: {offset['left_over']:.2f} times what was predicted",
@@ -51,9 +52,10 @@ def _offset_lines(offset: dict[str, Any]) -> list[str]:
 
 def _hold_out_lines(hold_out: dict[str, Any]) -> list[str]:
     splits = hold_out["splits"]
-    first = splits[0]
+    first, names = splits[0], hold_out["left_out"]
+    without = f", without {', '.join(names)}, which contradict the others" if names else ""
     return [
-        f"{len(splits)} splits into {len(first['control'])} control and {len(first['check'])} check points:",
+        f"{len(splits)} splits into {len(first['control'])} control and {len(first['check'])} check points{without}:",
         f"  RMSE of check points E/N/H, median {cm(hold_out['median_rmse_m'])}, "
         f"largest {cm(hold_out['largest_rmse_m'])}",
         f"  the first one, adjusted, differs by {1e3 * hold_out['first_split_adjusted_differs_m']:.2f} mm or less",

@@ -57,7 +57,7 @@ def test_the_offset_of_the_positions_is_found_in_two_ways(adjusted: Path) -> Non
 
 
 def test_splits_agree_with_an_adjustment(adjusted: Path) -> None:
-    hold_out = json.loads((adjusted / "report.json").read_text(encoding="utf-8"))["hold_out"]
+    hold_out = json.loads((adjusted / "report.json").read_text(encoding="utf-8"))["hold_outs"][0]
     assert len(hold_out["splits"]) == 6
     assert hold_out["first_split_adjusted_differs_m"] < 3e-3
     assert 0.002 < max(hold_out["median_rmse_m"]) < 0.05
@@ -109,3 +109,20 @@ def _disturbed() -> BalProblem:
     xy = row[:, 6:7] * (1 + row[:, 7:8] * r2 + row[:, 8:9] * r2**2) * slope + rng.normal(size=(1200, 2))
     off = cameras + rng.normal(size=cameras.shape) * [*[0.01] * 3, *[0.05] * 3, 10.0, 0.01, 0.001]
     return BalProblem(camera, point, xy, off, points + 0.05 * rng.normal(size=points.shape))
+
+
+def test_the_page_and_the_status_say_what_was_found(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = write_flight(flight(2), tmp_path / "f", control='["P0", "P2", "P4", "P6"]')
+    assert exit_code(app, ["status", str(folder)]) == 0
+    assert "new      not adjusted yet" in capsys.readouterr().out
+    assert exit_code(app, ["adjust", str(folder)]) == 0
+    page = (folder / "epochs" / "flight" / "report.html").read_text(encoding="utf-8")
+    assert page.count("<svg") == 6  # control, check points, all control, GNSS, ellipses; one camera
+    assert "Baarda" in page
+    assert "GNSS positions" in page
+    assert exit_code(app, ["status", str(folder)]) == 0
+    assert "done     28 images" in capsys.readouterr().out
+    table = folder / "surveyed.csv"
+    table.write_text(table.read_text(encoding="utf-8") + "\n", encoding="utf-8")
+    assert exit_code(app, ["status", str(folder)]) == 0
+    assert "stale    changed: surveyed.csv" in capsys.readouterr().out
