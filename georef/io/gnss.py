@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
-from datetime import UTC, datetime
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -28,8 +27,6 @@ class GnssTable(PositionTable):
     heading_deg: Array  # (N,)
     cameras: tuple[str, ...]
     stations: tuple[str, ...]
-    times_s: Array = field(default_factory=lambda: np.zeros(0))  # (N,) of column `time`; empty without one
-    flights: tuple[str, ...] = ()  # N, of the column that was asked for; empty without
 
     @property
     def unstated(self) -> bool:
@@ -43,9 +40,8 @@ def read_gnss(
     crs_kind: CrsKind,
     columns: Mapping[str, str] | None = None,
     table_format: TableFormat | None = None,
-    flight: str | None = None,
 ) -> GnssTable:
-    """Read image, position, three sigmas (m) and optionally heading_deg, camera, station, time and the column `flight`.
+    """Read image, position, three sigmas (m) and optionally heading_deg, camera and station.
 
     A file may be without any column of sigmas; some of them alone are refused. Raises InputError for columns that are
     missing, values that cannot be, sigmas that are not positive, and images
@@ -65,8 +61,6 @@ def read_gnss(
         heading_deg=_headings(table),
         cameras=table.text("camera") if table.has("camera") else ("",) * len(table),
         stations=table.text("station") if table.has("station") else ("",) * len(table),
-        times_s=_times(table),
-        flights=() if flight is None else table.ids(flight),
     )
 
 
@@ -78,32 +72,6 @@ def _sigmas(table: Table, crs_kind: CrsKind, image_ids: tuple[str, ...]) -> Arra
         expected="a positive standard deviation in metres (RTK: 0.02 to 0.05; single receiver: 1 to 5).",
         remedy=lambda _: "Correct the value, or delete the row if the image has no GNSS position.",
     )
-
-
-def _times(table: Table) -> Array:
-    """Seconds (N,), of numbers or of dates and times (ISO 8601; UTC where they name no zone)."""
-    if not table.has("time"):
-        return np.zeros(0)
-    out = np.empty(len(table))
-    for i, text in enumerate(table.ids("time")):
-        try:
-            out[i] = float(text)
-        except ValueError:
-            out[i] = _instant(table, i, text)
-    return out
-
-
-def _instant(table: Table, index: int, text: str) -> float:
-    try:
-        instant = datetime.fromisoformat(text)
-    except ValueError:
-        raise table.error(
-            index,
-            f"Column 'time' has {text!r}.",
-            expected="seconds, or a date and time such as 2024-05-31T10:15:20.125.",
-            remedy="Correct the value.",
-        ) from None
-    return (instant if instant.tzinfo else instant.replace(tzinfo=UTC)).timestamp()
 
 
 def _headings(table: Table) -> Array:

@@ -19,7 +19,6 @@ from georef.estimation.adjustment.block_correlations import (
     shared_unknowns,
     strong_correlations,
 )
-from georef.estimation.adjustment.block_quality import CONTROL
 from georef.estimation.adjustment.block_solutions import (
     CleanBlock,
     Solved,
@@ -28,6 +27,7 @@ from georef.estimation.adjustment.block_solutions import (
     solved,
     without_offset,
 )
+from georef.estimation.adjustment.solution_quality import CONTROL
 from georef.io.files import write_text_atomically
 from georef.project import Project
 from georef.report.block_page import render_block

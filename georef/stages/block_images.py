@@ -119,7 +119,7 @@ def images_of_block(
         oriented = oriented & (held if rig is not None and held.any() else True)
     _require_starts(tables, oriented, station, ids, measured)
     antennas, antenna = antennas_of(section.gnss, cameras, rig=rig is not None)
-    priors, drift = position_priors(section.gnss, tables.gnss, gnss_rows, ids, station, antenna, world)
+    priors, drift = position_priors(section.gnss, tables, gnss_rows, ids, station, antenna, world)
     return BlockImages(
         *(str(measured.path), ids, cameras, tuple(index), station, mountings, mounting),
         *(oriented, poses, positions, priors, antennas, antenna, drift),

@@ -14,7 +14,7 @@ from georef.estimation.adjustment.block import Block, Distances
 from georef.evaluation.forward_intersection import Intersection, PosedImages, intersect
 from georef.geometry.rigid import Array
 from georef.io.columns import CrsKind
-from georef.io.points import PointTable, read_points
+from georef.io.partial_points import PartialPoints, read_partial_points
 from georef.project import Project
 from georef.sections import BlockSection
 from georef.stages.reference import table_format
@@ -26,31 +26,29 @@ logger = logging.getLogger(__name__)
 _NEXT_TO_NOTHING_M = 1e4  # 1-sigma of a coordinate that is not given
 
 
-def read_surveyed(project: Project, kind: CrsKind) -> PointTable | None:
+def read_surveyed(project: Project, kind: CrsKind) -> PartialPoints | None:
     """The table of points, if the project has one. Raises InputError or CrsError."""
     section = project.file.points
     if section is None:
         return None
-    table = read_points(
+    table = read_partial_points(
         project.data(section.coordinates),
         crs_kind=kind,
         columns=section.table.columns or None,
         table_format=table_format(section.table),
-        role="control",
-        partial=True,
     )
     check_frame(_placed(table), CrsDefinition(project.file.crs.horizontal, project.file.crs.height))
     return table
 
 
-def _placed(table: PointTable) -> PointTable:
+def _placed(table: PartialPoints) -> PartialPoints:
     """The rows that have all coordinates, for checks of where they are."""
     whole = np.isfinite(table.positions_in_crs).all(axis=1)
     return replace(table, positions_in_crs=table.positions_in_crs[whole], rows=table.rows[whole])
 
 
 def surveyed_points(
-    table: PointTable,
+    table: PartialPoints,
     marks: Sequence[tuple[Mark, ...]],
     started: Block,
     world: WorldFrame,
@@ -61,7 +59,7 @@ def surveyed_points(
     there = np.flatnonzero(np.isfinite(positions).all(axis=1))
     for i in np.flatnonzero(~np.isfinite(positions).all(axis=1)).tolist():
         logger.warning("%s: nothing tells where point %s is: it is left out", table.path, table.point_ids[i])
-    known = np.ones((len(table), 3), bool) if table.known is None else table.known
+    known = table.known
     in_world = world.world_from_crs(positions[there])
     sigmas = np.where(known, table.sigmas_m, _NEXT_TO_NOTHING_M)[there]
     covs = np.zeros((len(there), 3, 3))
@@ -82,7 +80,7 @@ def _information(cov: Array, rank: int) -> Array:
     return (vectors[:, :rank] / values[:rank]) @ vectors[:, :rank].T
 
 
-def _filled(table: PointTable, marks: Sequence[tuple[Mark, ...]], started: Block, world: WorldFrame) -> Array:
+def _filled(table: PartialPoints, marks: Sequence[tuple[Mark, ...]], started: Block, world: WorldFrame) -> Array:
     """Coordinates (N, 3) in the CRS; rows of NaN where nothing tells them."""
     positions = table.positions_in_crs.copy()
     missing = np.flatnonzero(~np.isfinite(positions).all(axis=1))
@@ -99,7 +97,7 @@ def _filled(table: PointTable, marks: Sequence[tuple[Mark, ...]], started: Block
 
 
 def marks_of(
-    table: PointTable, prefix: str | None, point_ids: Sequence[str], image_ids: Sequence[str], observed: Observations
+    table: PartialPoints, prefix: str | None, point_ids: Sequence[str], image_ids: Sequence[str], observed: Observations
 ) -> list[tuple[Mark, ...]]:
     """The marks of each point of the table; `observed` are of measured points (ids P) in images (ids M)."""
     index = {point: i for i, point in enumerate(point_ids)}
@@ -114,12 +112,19 @@ def marks_of(
 
 
 def roles(
-    name: str, section: BlockSection, table: PointTable | None, surveyed: Sequence[ControlPoint]
+    name: str, section: BlockSection, table: PartialPoints | None, surveyed: Sequence[ControlPoint]
 ) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Ids of control and of check points, as the project and its table declare them. Raises InputError."""
     known = tuple(point.point_id for point in surveyed)
     if section.control == "table":
-        given = {} if table is None else dict(zip(table.point_ids, table.roles, strict=True))
+        if table is None or table.roles is None:
+            raise InputError(
+                f'blocks.{name}.control = "table", and no table of points has a column `role`.',
+                expected="control or check in that column, of each point.",
+                remedy="Add the column, or list the ids of control points in project.toml.",
+                path=None if table is None else table.path,
+            )
+        given = dict(zip(table.point_ids, table.roles, strict=True))
         control = tuple(point for point in known if given.get(point) == "control")
     elif isinstance(section.control, str):
         control = known if section.control == "all" else ()
@@ -131,7 +136,7 @@ def roles(
     return tuple(point for point in control if point not in set(check)), check
 
 
-def _known_ids(key: str, ids: tuple[str, ...], known: tuple[str, ...], table: PointTable | None) -> tuple[str, ...]:
+def _known_ids(key: str, ids: tuple[str, ...], known: tuple[str, ...], table: PartialPoints | None) -> tuple[str, ...]:
     unknown = [point for point in ids if point not in known]
     if unknown:
         raise InputError(

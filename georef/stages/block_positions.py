@@ -14,7 +14,7 @@ from georef.geometry.rigid import Array
 from georef.io.gnss import GnssTable
 from georef.io.table import IntArray
 from georef.sections import BlockGnss, GnssDrift
-from georef.stages.block_tables import by_pattern
+from georef.stages.block_tables import BlockTables, by_pattern
 
 _SAME_PLACE_M = 0.01
 
@@ -53,7 +53,7 @@ def antennas_of(
 
 def position_priors(
     section: BlockGnss | None,
-    gnss: GnssTable | None,
+    tables: BlockTables,
     rows: IntArray,
     image_ids: Sequence[str],
     station: IntArray,
@@ -62,6 +62,7 @@ def position_priors(
 ) -> tuple[PositionPriors, Array]:
     """One position an exposure that has one, that of its first image with a row (rows (M,), -1: none), and the
     information (D, 3, 3) of the drift. Raises InputError where images of one exposure disagree."""
+    gnss = tables.gnss
     if gnss is None or section is None:
         return PositionPriors.none(), np.zeros((0, 3, 3))
     there = np.flatnonzero(rows >= 0)
@@ -72,7 +73,7 @@ def position_priors(
     _refuse_apart(gnss, rows, there, station, dict(zip(stations.tolist(), positions, strict=True)), world)
     covs = np.zeros((len(own), 3, 3))
     covs[:, range(3), range(3)] = np.square(gnss.sigmas_m[own])
-    node, weight, information = _drift(section, gnss, own, [image_ids[int(i)] for i in images])
+    node, weight, information = _drift(section, tables, own, [image_ids[int(i)] for i in images])
     return PositionPriors(
         station=stations,
         position=positions,
@@ -101,7 +102,7 @@ def _refuse_apart(
 
 
 def _drift(
-    section: BlockGnss, gnss: GnssTable, rows: IntArray, image_ids: Sequence[str]
+    section: BlockGnss, tables: BlockTables, rows: IntArray, image_ids: Sequence[str]
 ) -> tuple[IntArray, Array, Array]:
     """Nodes (K, 2) and weights (K, 2) of K positions, and the information (D, 3, 3) of D nodes."""
     count = len(rows)
@@ -110,7 +111,7 @@ def _drift(
     if sigma is None:
         return node, weight, np.zeros((0, 3, 3))
     drift = section.drift or GnssDrift(sigma_m=sigma)
-    flights = _flights(drift, gnss, rows, image_ids)
+    flights = _flights(drift, tables, rows, image_ids)
     nodes = 0
     for name in dict.fromkeys(flights):
         here = np.flatnonzero([flight == name for flight in flights])
@@ -118,7 +119,7 @@ def _drift(
             node[here, 0], weight[here, 0] = nodes, 1.0
             nodes += 1
             continue
-        times = _times(gnss, rows[here], drift.interval_s)
+        times = _times(tables, rows[here], drift.interval_s)
         pieces = max(int(np.ceil(np.ptp(times) / drift.interval_s)), 1)
         along = (times - times.min()) / max(float(np.ptp(times)), 1e-9) * pieces
         piece = np.minimum(along.astype(np.int64), pieces - 1)
@@ -129,20 +130,20 @@ def _drift(
     return node, weight, information
 
 
-def _flights(drift: GnssDrift, gnss: GnssTable, rows: IntArray, image_ids: Sequence[str]) -> tuple[str, ...]:
-    if drift.flight is not None:
-        return tuple(gnss.flights[row] for row in rows)
+def _flights(drift: GnssDrift, tables: BlockTables, rows: IntArray, image_ids: Sequence[str]) -> tuple[str, ...]:
+    if tables.flights is not None:
+        return tuple(tables.flights[row] for row in rows)
     if drift.flight_pattern is not None:
         return by_pattern(drift.flight_pattern, image_ids, "flight")
     return ("",) * len(rows)
 
 
-def _times(gnss: GnssTable, rows: IntArray, interval_s: float) -> Array:
-    if not len(gnss.times_s):
+def _times(tables: BlockTables, rows: IntArray, interval_s: float) -> Array:
+    if tables.times_s is None:
         raise InputError(
             f"gnss.drift.interval_s = {interval_s:g} asks for times, and the table of positions has none.",
             expected="a column `time`: seconds, or a date and time.",
             remedy='Add the column, or map it: table.columns = { time = "..." }.',
-            path=gnss.path,
+            path=None if tables.gnss is None else tables.gnss.path,
         )
-    return gnss.times_s[rows]
+    return tables.times_s[rows]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,18 +11,16 @@ from georef.errors import InputError
 from georef.estimation.adjustment.block import RigCamera
 from georef.geometry.camera import Camera
 from georef.geometry.poses import Poses
-from georef.geometry.rigid import Array, Rigid3
+from georef.geometry.rigid import Rigid3
 from georef.io.exterior_orientation import ExteriorOrientationTable
 from georef.io.gnss import GnssTable
-from georef.io.rig_table import FREE, read_rig
+from georef.io.mounting_table import StatedMounting, read_mountings
 from georef.io.table import IntArray
 from georef.project import Project
 from georef.sections import BlockRig
 from georef.stages.block_tables import BlockTables, by_pattern, rows_of
-from georef.types.campaign import Mounting
 
 _SAME_PLACE_M = 1e-3
-_FREE_VARIANCE = np.diag([np.radians(FREE[1]) ** 2] * 3 + [FREE[0] ** 2] * 3)
 
 
 def stations_of(rig: BlockRig | None, tables: BlockTables, image_ids: Sequence[str]) -> tuple[str, ...]:
@@ -41,7 +38,7 @@ def stations_of(rig: BlockRig | None, tables: BlockTables, image_ids: Sequence[s
         )
     rows = rows_of(table, image_ids)
     if rig.station_within_s is not None:
-        return _at_one_time(table, rows, image_ids, rig.station_within_s)
+        return _at_one_time(tables, rows, image_ids, rig.station_within_s)
     if rig.station == "position":
         return _at_one_place(table, rows, image_ids)
     named = [table.stations[row] if row >= 0 else "" for row in rows]
@@ -55,16 +52,16 @@ def stations_of(rig: BlockRig | None, tables: BlockTables, image_ids: Sequence[s
     return tuple(name or image for name, image in zip(named, image_ids, strict=True))
 
 
-def _at_one_time(table: GnssTable, rows: IntArray, image_ids: Sequence[str], within_s: float) -> tuple[str, ...]:
+def _at_one_time(tables: BlockTables, rows: IntArray, image_ids: Sequence[str], within_s: float) -> tuple[str, ...]:
     """Exposures are named by their first image in time; gaps between them are longer than within_s."""
-    if not len(table.times_s) or (rows < 0).any():
+    if tables.times_s is None or (rows < 0).any():
         raise InputError(
             "Not every image has a time of exposure.",
             expected="a column `time` in the table of positions, and a row for each image, for rig.station_within_s.",
             remedy='Add it, or map it: table.columns = { time = "..." }.',
-            path=table.path,
+            path=None if tables.gnss is None else tables.gnss.path,
         )
-    times = table.times_s[rows]
+    times = tables.times_s[rows]
     order = np.argsort(times, kind="stable")
     fresh = np.concatenate([[True], np.diff(times[order]) > within_s])
     first = order[np.flatnonzero(fresh)[np.cumsum(fresh) - 1]]
@@ -103,12 +100,12 @@ def mountings_of(
     _refuse_twice(names, image_ids, station)
     if rig.file is not None:
         path = project.data(rig.file)
-        given = read_rig(path, allow_free=True)
+        given = read_mountings(path)
         _require_mounted(given, names, image_ids, str(path))
         if rig.reference is not None and rig.reference not in given:
             raise _unknown_reference(rig.reference, tuple(given), str(path))
         used = {name: mounting for name, mounting in given.items() if name in set(names)}
-        mountings = tuple(_weighted(mounting, rig.reference) for mounting in used.values())
+        mountings = tuple(_weighted(name, mounting, rig.reference) for name, mounting in used.items())
     else:
         assert attitude is not None, "validated: a rig without a table has attitudes"
         mountings = _from_attitudes(rig, names, station, attitude, oriented)
@@ -122,12 +119,8 @@ def mountings_of(
     return mountings, np.array([index[name] for name in names], dtype=np.int64)
 
 
-def _weighted(mounting: Mounting, reference: str | None) -> RigCamera:
-    if mounting.cov is None or mounting.camera == reference:
-        return RigCamera(mounting.camera, mounting.rig_from_cam)
-    if np.array_equal(np.diag(mounting.cov), np.diag(_FREE_VARIANCE)):
-        return RigCamera(mounting.camera, mounting.rig_from_cam, np.zeros((6, 6)))
-    return RigCamera(mounting.camera, mounting.rig_from_cam, cast(Array, np.linalg.inv(mounting.cov)))
+def _weighted(name: str, mounting: StatedMounting, reference: str | None) -> RigCamera:
+    return RigCamera(name, mounting.rig_from_cam, None if name == reference else mounting.information)
 
 
 def _defined(mountings: tuple[RigCamera, ...]) -> bool:
@@ -181,7 +174,7 @@ def _refuse_twice(names: Sequence[str], image_ids: Sequence[str], station: IntAr
             )
 
 
-def _require_mounted(given: Mapping[str, Mounting], names: Sequence[str], ids: Sequence[str], path: str) -> None:
+def _require_mounted(given: Mapping[str, StatedMounting], names: Sequence[str], ids: Sequence[str], path: str) -> None:
     for image, name in zip(ids, names, strict=True):
         if name not in given:
             raise InputError(

@@ -55,14 +55,14 @@ class BlockSurvey:
     @property
     def whole(self) -> tuple[ControlPoint, ...]:
         """The surveyed points of which all coordinates are given."""
-        return tuple(point for point in self.surveyed if point.whole)
+        return tuple(point for point in self.surveyed if point.partial is None)
 
     def control(self, ids: Sequence[str]) -> tuple[ControlPoint, ...]:
         return tuple(point for point in self.surveyed if point.point_id in set(ids))
 
     def partly_known(self, control_ids: Sequence[str]) -> tuple[ControlPoint, ...]:
         """The surveyed points that are not control, of which the height or the horizontal coordinates are not given."""
-        return tuple(p for p in self.surveyed if not p.whole and p.point_id not in set(control_ids))
+        return tuple(p for p in self.surveyed if p.partial is not None and p.point_id not in set(control_ids))
 
     def check(self, control_ids: Sequence[str]) -> tuple[CheckPoint, ...]:
         """All surveyed points with all coordinates that are not control."""
@@ -70,7 +70,7 @@ class BlockSurvey:
         return tuple(
             CheckPoint(p.point_id, self.check_kind, p.point_in_world, p.cov, p.marks)
             for p in self.surveyed
-            if p.point_id not in control and p.whole
+            if p.point_id not in control and p.partial is None
         )
 
 

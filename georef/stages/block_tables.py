@@ -16,6 +16,7 @@ from georef.errors import InputError
 from georef.geometry.rigid import Array
 from georef.io.bingo import BingoTable
 from georef.io.columns import CrsKind
+from georef.io.exposures import Exposures, read_exposures
 from georef.io.exterior_orientation import ExteriorOrientationTable, read_exterior_orientation
 from georef.io.gnss import GnssTable, read_gnss
 from georef.io.table import IntArray
@@ -33,6 +34,8 @@ class BlockTables:
 
     gnss: GnssTable | None
     attitude: ExteriorOrientationTable | None
+    times_s: Array | None = None  # of the rows of gnss; None: not said
+    flights: tuple[str, ...] | None = None  # the same; None: not asked for
 
     @property
     def positions_in_crs(self) -> Array:
@@ -42,16 +45,14 @@ class BlockTables:
 def read_tables(project: Project, section: BlockSection, kind: CrsKind, definition: CrsDefinition) -> BlockTables:
     """Positions and rotations as the section declares them. Raises InputError or CrsError."""
     gnss = attitude = None
+    said = Exposures(None, None)
     if section.gnss is not None:
         table = section.gnss.table
         path = project.data(section.gnss.file)
-        gnss = read_gnss(
-            path,
-            crs_kind=kind,
-            columns=table.columns or None,
-            table_format=table_format(table),
-            flight=None if section.gnss.drift is None else section.gnss.drift.flight,
-        )
+        written = {"columns": table.columns or None, "table_format": table_format(table)}
+        gnss = read_gnss(path, crs_kind=kind, **written)
+        drift = section.gnss.drift
+        said = read_exposures(path, flight=None if drift is None else drift.flight, **written)
         check_frame(gnss, definition)
         if gnss.unstated and section.gnss.sigma_m is None:
             raise InputError(
@@ -74,7 +75,7 @@ def read_tables(project: Project, section: BlockSection, kind: CrsKind, definiti
             table_format=table_format(given.table),
         )
         check_frame(attitude, definition)
-    return BlockTables(gnss, attitude)
+    return BlockTables(gnss, attitude, said.times_s, said.flights)
 
 
 def rows_of(

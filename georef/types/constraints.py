@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from enum import StrEnum
 
+import numpy as np
+
 from georef.geometry.rigid import Array
 from georef.types.campaign import require_covariance
 
@@ -33,23 +35,23 @@ class Mark:
 class ControlPoint:
     """A point whose coordinates take part in the adjustment.
 
-    information: (3, 3) in world, of lower rank where only its height, or only its horizontal coordinates are given; the
-    covariance says next to nothing of the others then. None: the inverse of the covariance.
+    partial: (3, 3) information of rank 2 (horizontal) or 1 (height) where not all of them are known; the others are
+    approximate, and cov is wide along them.
     """
 
     point_id: str
     point_in_world: Array  # (3,)
     cov: Array  # (3, 3)
     marks: tuple[Mark, ...]
-    information: Array | None = None
+    partial: Array | None = None
+
+    @property
+    def information(self) -> Array:
+        """(3, 3), of rank 1 to 3."""
+        return np.asarray(np.linalg.inv(self.cov), dtype=np.float64) if self.partial is None else self.partial
 
     def __post_init__(self) -> None:
         require_covariance(self.cov, 3)
-
-    @property
-    def whole(self) -> bool:
-        """Whether all three coordinates are given."""
-        return self.information is None
 
 
 @dataclass(frozen=True, eq=False)

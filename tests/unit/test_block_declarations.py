@@ -12,9 +12,9 @@ from georef.errors import ConfigError, InputError
 from georef.estimation.adjustment.block_correlations import shared_unknowns
 from georef.estimation.adjustment.block_solutions import clean, solve_with_control
 from georef.io.bingo import read_bingo, sensor_of_header
+from georef.io.mounting_table import read_mountings
 from georef.io.pix4d import read_pix4d_camera, read_pix4d_cameras
 from georef.io.pix4d_ties import read_pix4d_ties, write_pix4d_ties
-from georef.io.rig_table import read_rig
 from georef.project import open_project
 from georef.stages.block_numbers import control_numbers, distance_numbers, named, partial_check_numbers
 from georef.stages.block_survey import BlockSurvey, load_block
@@ -45,7 +45,7 @@ def test_horizontal_and_height_control_take_part_with_what_they_know(tmp_path: P
     folder = write_flight(made, tmp_path)
     _rewritten(folder / "surveyed.csv", {"P0": _row(made, 0, horizontal=True), "P1": _row(made, 1, horizontal=False)})
     survey = _survey(folder)
-    assert [point.point_id for point in survey.surveyed if not point.whole] == ["P0", "P1"]
+    assert [point.point_id for point in survey.surveyed if point.partial is not None] == ["P0", "P1"]
     placed = survey.world.crs_from_world(survey.surveyed[1].point_in_world[None])[0]
     assert 0.0 < np.linalg.norm(placed - made.surveyed[1]) < 15.0  # by its marks
     cleaned = clean(survey.block, _CONFIG)
@@ -209,11 +209,14 @@ def test_a_free_mounting_has_empty_sigmas(tmp_path: Path) -> None:
     path.write_text(
         "camera,x,y,z,omega,phi,kappa,sigma_m,sigma_deg\nN,0,0,0,0,0,0,0,0\nF,0.1,0,0,45,0,0,,\n", encoding="utf-8"
     )
-    rig = read_rig(path, allow_free=True)
-    assert rig["N"].cov is None
-    assert rig["F"].cov is not None
+    rig = read_mountings(path)
+    assert rig["N"].information is None
+    assert np.array_equal(rig["F"].information, np.zeros((6, 6)))
     # omega turns the image's y (up) towards its z (the viewer): the camera looks towards the top of the picture
     axis = rig["F"].rig_from_cam.rotation[:, 2]
     assert axis == pytest.approx([0.0, -np.sqrt(0.5), np.sqrt(0.5)])
-    with pytest.raises(InputError, match="Column 'sigma_m' is empty"):
-        read_rig(path)
+    text = path.read_text(encoding="utf-8")
+    for wrong, said in ((",0.01,", "has sigma_m, sigma_deg = 0.01, nan"), (",0,0", "both have sigmas of 0")):
+        path.write_text(text.replace("45,0,0,,", "45,0,0" + wrong), encoding="utf-8")
+        with pytest.raises(InputError, match=said):
+            read_mountings(path)

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -120,7 +119,7 @@ def solve_with_control(
     names = tuple(point.point_id for point in control)
     if not control:
         return solved(block, start, check, config)
-    found = adjust_block(block, options_of(config), start)
+    found = adjust_block(block, options_of(config), start=start)
     checked = check_block(found.block, found.solution.state, found.quality.cofactors.apply, check)
     marks = rejected_marks(block, found, control)
     return Solved(found.block, found.solution, found.quality, checked, found.rejected, marks, names)
@@ -141,7 +140,7 @@ def with_control(block: Block, control: Sequence[ControlPoint]) -> Block:
     priors = PointPriors(
         point=first + np.arange(len(control)),
         position=positions,
-        information=np.array([_information(point) for point in control], dtype=np.float64).reshape(-1, 3, 3),
+        information=np.array([point.information for point in control], dtype=np.float64).reshape(-1, 3, 3),
         kind=np.zeros(len(control), np.int64),
         point_ids=tuple(point.point_id for point in control),
     )
@@ -151,10 +150,6 @@ def with_control(block: Block, control: Sequence[ControlPoint]) -> Block:
         observations=Observations.joined([block.observations, marks.with_points(first + marks.point)]),
         point_priors=priors,
     )
-
-
-def _information(point: ControlPoint) -> Array:
-    return cast(Array, np.linalg.inv(point.cov)) if point.information is None else point.information
 
 
 def without_offset(block: Block) -> Block:
