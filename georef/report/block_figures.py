@@ -19,7 +19,7 @@ class _Frame:
 
     def __init__(self, places: np.ndarray) -> None:
         low, high = places.min(axis=0), places.max(axis=0)
-        span = np.maximum(high - low, 1.0)
+        span = np.maximum(np.asarray(high - low), 1.0)
         self.scale = min((_WIDTH - 2 * _MARGIN) / span[0], (_HEIGHT - 2 * _MARGIN) / span[1])
         self.low, self.high = low, high
         self.height = span[1] * self.scale + 2 * _MARGIN

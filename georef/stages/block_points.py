@@ -27,8 +27,9 @@ logger = logging.getLogger(__name__)
 _NEXT_TO_NOTHING_M = 1e4  # 1-sigma of a coordinate that is not given
 
 
-def read_surveyed(project: Project, kind: CrsKind) -> PointTable | None:
-    """The table of points, if the project has one. Raises InputError or CrsError."""
+def read_surveyed(project: Project, kind: CrsKind, *, with_roles: bool) -> PointTable | None:
+    """The table of points, if the project has one; with_roles: it must have a column that says who is control. Raises
+    InputError or CrsError."""
     section = project.file.points
     if section is None:
         return None
@@ -37,7 +38,7 @@ def read_surveyed(project: Project, kind: CrsKind) -> PointTable | None:
         crs_kind=kind,
         columns=section.table.columns or None,
         table_format=table_format(section.table),
-        role="control",
+        role=None if with_roles else "control",
         partial=True,
     )
     check_frame(_placed(table), CrsDefinition(project.file.crs.horizontal, project.file.crs.height))

@@ -86,7 +86,7 @@ def load_block(project: Project, name: str) -> BlockSurvey:
     world = WorldFrame.create(definition, origin)
     images = images_of_block(project, section, tables, measured, world)
     observations = _observations(measured, images, section.observations)
-    table = read_surveyed(project, kind)
+    table = read_surveyed(project, kind, with_roles=section.control == "table")
     prefix = section.observations.mark_prefix
     given = set() if table is None or prefix is None else {f"{prefix}{point}" for point in table.point_ids}
     ties, tie_ids = _ties(measured, observations, given)

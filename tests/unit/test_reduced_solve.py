@@ -118,9 +118,7 @@ def test_near_the_solution_one_step_is_enough_for_points_as_well() -> None:
     """Mountings and calibrations move too: points that are found again without these stay beside their best places."""
     block = rig_block(1).block
     assert any(m.information is not None for m in block.mountings)
-    assert any(
-        c.camera.estimate for c in block.calibrations
-    )
+    assert any(c.camera.estimate for c in block.calibrations)
     best = solve_block(block, options=SolverOptions(step_tolerance=1e-10)).state
     rng = np.random.default_rng(2)
     equations = BlockEquations(block)
