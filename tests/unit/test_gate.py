@@ -10,10 +10,10 @@ from scipy.stats import binom
 
 from georef.estimation.adjustment import block as adjustment
 from georef.estimation.adjustment.adjust_block import quality
-from georef.estimation.adjustment.block_gates import without_contradictions
+from georef.estimation.adjustment.block_gates import Contradictions, RejectedConstraint
 from georef.estimation.adjustment.constraint_terms import POSITION_PRIORS
 from georef.estimation.adjustment.eliminate import IMAGE_OBSERVATIONS
-from georef.estimation.adjustment.group_tests import constraint_tests
+from georef.estimation.adjustment.group_tests import TermTests, constraint_tests
 from georef.estimation.adjustment.network import worst_orientation
 from georef.estimation.adjustment.solver import solve_block
 from georef.geometry.poses import Poses
@@ -35,6 +35,13 @@ from tests.worlds.points import NOISE, scaled_noise
 
 _EXACT = scaled_noise(NOISE, poses=1e-6)
 _PROBABILITY = 0.9  # low, so that few runs show the rate
+
+
+def _gated(
+    whole: adjustment.Block, tests: list[TermTests], probability: float
+) -> tuple[adjustment.Block, tuple[RejectedConstraint, ...]]:
+    wrong = Contradictions.none(whole).joined(whole, tests, probability)
+    return wrong.without(whole), wrong.rejected
 
 
 def robust(whole: adjustment.Block) -> Solved:
@@ -64,7 +71,7 @@ def test_priors_are_falsely_rejected_at_the_stated_rate() -> None:
             control=control(made.world, rng, count=4),
         )
         found = Solved.of(images_alone(problem))
-        kept, bad = without_contradictions(found.block, found.quality.constraints, _PROBABILITY)
+        kept, bad = _gated(found.block, found.quality.constraints, _PROBABILITY)
         tested += 4
         count = {name: sum(r.kind == name for r in bad) for name in rejected}
         rejected = {name: rejected[name] + count[name] for name in rejected}
@@ -85,7 +92,7 @@ def test_errors_that_references_share_are_not_held_against_control_points() -> N
         part = found.quality
         naive = constraint_tests(found.block, found.state, part.cofactors, part.images.points)
         for tests, honest in ((part.constraints, True), (naive, False)):
-            _, bad = without_contradictions(found.block, tests, 0.99)
+            _, bad = _gated(found.block, tests, 0.99)
             count = sum(r.kind == "control" for r in bad)
             rejected, naively = rejected + honest * count, naively + (not honest) * count
     assert rejected <= 3  # of 75
@@ -172,7 +179,7 @@ def test_what_nothing_checks_is_never_rejected() -> None:
     for priors, rejected in (({3: distance_to(3, 1.0)}, 0), ({3: distance_to(3, 1.0), 2: distance_to(2, 0.0)}, 2)):
         problem = replace(without_gcps(made.problem), position_priors=priors)
         found = Solved.of(with_orientations(images_alone(problem), given, [0]))
-        _, bad = without_contradictions(found.block, found.quality.constraints, 0.999)
+        _, bad = _gated(found.block, found.quality.constraints, 0.999)
         assert sum(r.kind == POSITION_PRIORS for r in bad) == rejected
         assert worst_orientation(found.block, found.quality, 0.999) is None
 
