@@ -211,7 +211,8 @@ def test_a_free_mounting_has_empty_sigmas(tmp_path: Path) -> None:
     )
     rig = read_mountings(path)
     assert rig["N"].information is None
-    assert np.array_equal(rig["F"].information, np.zeros((6, 6)))
+    assert rig["F"].information is not None
+    assert not rig["F"].information.any()
     # omega turns the image's y (up) towards its z (the viewer): the camera looks towards the top of the picture
     axis = rig["F"].rig_from_cam.rotation[:, 2]
     assert axis == pytest.approx([0.0, -np.sqrt(0.5), np.sqrt(0.5)])
