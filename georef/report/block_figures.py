@@ -20,9 +20,10 @@ class _Frame:
     def __init__(self, places: np.ndarray) -> None:
         low, high = places.min(axis=0), places.max(axis=0)
         span = np.maximum(np.asarray(high - low), 1.0)
-        self.scale = min((_WIDTH - 2 * _MARGIN) / span[0], (_HEIGHT - 2 * _MARGIN) / span[1])
+        wide, tall = (_WIDTH - 2 * _MARGIN) / float(span[0]), (_HEIGHT - 2 * _MARGIN) / float(span[1])
+        self.scale = wide if wide < tall else tall
         self.low, self.high = low, high
-        self.height = span[1] * self.scale + 2 * _MARGIN
+        self.height = float(span[1]) * self.scale + 2 * _MARGIN
 
     def at(self, place: Any) -> tuple[float, float]:
         x = _MARGIN + (float(place[0]) - self.low[0]) * self.scale

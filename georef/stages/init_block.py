@@ -9,15 +9,20 @@ Cameras start from Pix4D's calibrations and rotations from its poses; neither is
 from __future__ import annotations
 
 import json
+import tomllib
 from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
 
+from georef.config import validated
+from georef.crs import CrsDefinition, crs_kind
 from georef.errors import ConfigError
 from georef.geometry.camera import Camera
 from georef.io.camera_table import CAMERA_COLUMNS
+from georef.io.declarations import normalized_crs
 from georef.io.files import write_text_atomically
 from georef.io.pix4d import GIVEN_COLUMNS, read_pix4d_adjusted, read_pix4d_poses
+from georef.project import ProjectFile
 
 TIES = {"pix4d": "_tp_pix4d.txt", "bingo": "_tp_bingo.txt"}
 POSES, PARAMETERS, POINTS = (
@@ -56,6 +61,25 @@ def find_pix4d(data: Path) -> Pix4dFolder | None:
             f"In {data}.",
         )
     return Pix4dFolder(data, found[form][0], form, poses[0], parameters[0])
+
+
+def init_block(
+    path: Path, found: Pix4dFolder, crs: str | None, height: str | None, name: str | None
+) -> tuple[str, ...]:
+    """Writes project.toml of what Pix4D exported, and the table of its cameras; what was taken from where. Raises
+    ConfigError, InputError, CrsError."""
+    if crs is None:
+        raise ConfigError(
+            "Nothing says the coordinate reference system of the positions.",
+            "State it: --crs EPSG:32647 --height ellipsoidal, as Pix4D's output coordinate system is.",
+            f"In {found.data}.",
+        )
+    crs_kind(CrsDefinition(crs, height))
+    text, cameras, said = block_text(found, name or found.data.name, normalized_crs(crs), height)
+    validated(ProjectFile, tomllib.loads(text), str(path))
+    write_cameras(cameras, path.parent)
+    write_text_atomically(text, path)
+    return said
 
 
 def block_text(found: Pix4dFolder, name: str, horizontal: str, height: str | None) -> tuple[str, str, tuple[str, ...]]:

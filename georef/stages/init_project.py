@@ -28,7 +28,7 @@ from georef.io.exterior_orientation import exterior_orientation_from_table
 from georef.io.files import write_text_atomically
 from georef.io.tables import Table, read_table
 from georef.project import PROJECT_FILE, REFERENCE, ProjectFile
-from georef.stages.init_block import Pix4dFolder, block_text, find_pix4d, write_cameras
+from georef.stages.init_block import find_pix4d, init_block
 from georef.stages.init_files import EO_SUFFIX, GNSS_SUFFIX, Found, find_files
 from georef.types.constraints import CheckKind
 
@@ -77,7 +77,7 @@ def init_project(folder: Path, data: Path, answers: Answers) -> Written:
         )
     exports = find_pix4d(data)
     if exports is not None:
-        return _init_block(path, exports, answers)
+        return Written(path, init_block(path, exports, answers.crs, answers.height, answers.name))
     found = find_files(data)
     facts = _Facts(_tables(found, answers.columns), found)
     definition = _definition(facts, answers)
@@ -87,23 +87,6 @@ def init_project(folder: Path, data: Path, answers: Answers) -> Written:
     write_text_atomically(text, path)
     facts.said.append(f"epochs: {', '.join(found.epochs)}")
     return Written(path, tuple(facts.said))
-
-
-def _init_block(path: Path, exports: Pix4dFolder, answers: Answers) -> Written:
-    """A project of what Pix4D exported, and the table of its cameras."""
-    if answers.crs is None:
-        raise ConfigError(
-            "Nothing says the coordinate reference system of the positions.",
-            "State it: --crs EPSG:32647 --height ellipsoidal, as Pix4D's output coordinate system is.",
-            f"In {exports.data}.",
-        )
-    horizontal = normalized_crs(answers.crs)
-    crs_kind(CrsDefinition(answers.crs, answers.height))
-    text, cameras, said = block_text(exports, answers.name or exports.data.name, horizontal, answers.height)
-    validated(ProjectFile, tomllib.loads(text), str(path))
-    write_cameras(cameras, path.parent)
-    write_text_atomically(text, path)
-    return Written(path, said)
 
 
 def parse_columns(texts: Iterable[str]) -> dict[str, str]:
