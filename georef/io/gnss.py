@@ -28,7 +28,7 @@ class GnssTable(PositionTable):
     heading_deg: Array  # (N,)
     cameras: tuple[str, ...]
     stations: tuple[str, ...]
-    times_s: Array = field(default_factory=lambda: np.zeros(0))  # (N,) of column `time`; empty without one
+    times_s: Array = field(default_factory=lambda: np.zeros(0))  # (N,) of exposure; empty without such a column
     flights: tuple[str, ...] = ()  # N, of the column that was asked for; empty without
 
     @property
@@ -45,7 +45,8 @@ def read_gnss(
     table_format: TableFormat | None = None,
     flight: str | None = None,
 ) -> GnssTable:
-    """Read image, position, three sigmas (m) and optionally heading_deg, camera, station, time and the column `flight`.
+    """Read image, position, three sigmas (m) and optionally heading_deg, camera, station, time (or time_s) and the
+    column `flight`.
 
     A file may be without any column of sigmas; some of them alone are refused. Raises InputError for columns that are
     missing, values that cannot be, sigmas that are not positive, and images
@@ -81,25 +82,26 @@ def _sigmas(table: Table, crs_kind: CrsKind, image_ids: tuple[str, ...]) -> Arra
 
 
 def _times(table: Table) -> Array:
-    """Seconds (N,), of numbers or of dates and times (ISO 8601; UTC where they name no zone)."""
-    if not table.has("time"):
+    """Seconds (N,) of column `time` or `time_s`: numbers, or dates and times (ISO 8601, UTC where no zone is named)."""
+    name = next((name for name in ("time", "time_s") if table.has(name)), None)
+    if name is None:
         return np.zeros(0)
     out = np.empty(len(table))
-    for i, text in enumerate(table.ids("time")):
+    for i, text in enumerate(table.ids(name)):
         try:
             out[i] = float(text)
         except ValueError:
-            out[i] = _instant(table, i, text)
+            out[i] = _instant(table, name, i, text)
     return out
 
 
-def _instant(table: Table, index: int, text: str) -> float:
+def _instant(table: Table, name: str, index: int, text: str) -> float:
     try:
         instant = datetime.fromisoformat(text)
     except ValueError:
         raise table.error(
             index,
-            f"Column 'time' has {text!r}.",
+            f"Column {name!r} has {text!r}.",
             expected="seconds, or a date and time such as 2024-05-31T10:15:20.125.",
             remedy="Correct the value.",
         ) from None
