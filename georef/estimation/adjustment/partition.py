@@ -109,9 +109,9 @@ def _split(
 def _lower_side(
     chosen: Indices, share: float, positions: Array, load: Indices, incidence: tuple[Indices, Indices]
 ) -> Indices:
-    """The stations on one side of the cut with the fewest separators, of cuts across eight directions and the order of
-    the stations, in both senses, near the asked share of the observations."""
-    best, fewest = chosen[:1], len(chosen) + 1
+    """The stations on one side of the best cut across four directions or the order of the stations, in both senses,
+    near the asked share of the observations: few separators, one of which counts as much as a station too many."""
+    best, least = chosen[:1], 2.0 * len(chosen)
     for angle in (None, *np.arange(4) * np.pi / 4):
         key = chosen if angle is None else positions[chosen, :2] @ [np.cos(angle), np.sin(angle)]
         along = chosen[np.argsort(key, kind="stable")]
@@ -120,9 +120,10 @@ def _lower_side(
             count = _separators(order, len(positions), incidence)
             allowed = (reached > share - _UNEVEN) & (reached < share + _UNEVEN)
             allowed[-1] = False
-            cut = int(np.argmin(np.where(allowed, count, len(chosen))))
-            if allowed.any() and count[cut] < fewest:
-                best, fewest = order[: cut + 1], int(count[cut])
+            uneven = len(chosen) * np.abs(reached - share)
+            cut = int(np.argmin(np.where(allowed, count + uneven, 2 * len(chosen))))
+            if allowed[cut] and count[cut] + uneven[cut] < least:
+                best, least = order[: cut + 1], count[cut] + uneven[cut]
     return np.sort(best)
 
 

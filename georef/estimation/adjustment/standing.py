@@ -106,7 +106,10 @@ def with_lasting_names(block: Block) -> Block:
     change with every image that is added."""
     obs, given = block.observations, block.point_priors
     automatic = given.kind == KINDS_OF_POINT.index("automatic")
-    order = np.lexsort((obs.keypoint, np.array(block.image_ids, dtype=str)[obs.view], obs.point))
+    rank = np.empty(len(block.image_ids), np.int64)
+    rank[np.argsort(np.array(block.image_ids, dtype=str), kind="stable")] = np.arange(len(rank))
+    rays = np.flatnonzero(np.isin(obs.point, given.point[automatic]))
+    order = rays[np.lexsort((obs.keypoint[rays], rank[obs.view[rays]], obs.point[rays]))]
     seen, first = np.unique(obs.point[order], return_index=True)
     leader = dict(zip(seen.tolist(), order[first].tolist(), strict=True))
 
