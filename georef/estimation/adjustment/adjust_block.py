@@ -30,7 +30,6 @@ from georef.estimation.adjustment.solver import BlockSolution, Solve, SolverOpti
 
 _GATE_ROUNDS, _ROBUST_ROUNDS = 4, 2
 _ROBUST_COST_TOLERANCE = 1e-3  # reweighting converges slowly, and gates need no more
-_GATED_STEP = 1e-5  # of a solution that gates follow, m and rad: where the last one stops is the user's choice
 _FAR_OFF = 1.25  # of a sigma against its residuals
 _SETTLED_SHARE = 1e-4  # of the observations: a gate that drops fewer changes nothing
 _FACTOR_TOLERANCE = 0.05
@@ -109,7 +108,7 @@ def adjust_block(
     options = replace(options, reference_m=float(np.hypot(options.reference_m, shared_by_references(block))))
     hand = _InHand(block, Prepared.of(block))
     hand, state, found = _robust(hand, start or block.start(), options, solve)
-    options = replace(options, solver=replace(options.solver, damping=0.0))  # what follows starts near its solution
+    options = replace(options, solver=replace(options.solver, damping=1e-6))
     gated = hand.gated(found, _gross(options))
     search = search_coherent(
         *(gated.block, state, options.losses), reference_m=options.reference_m, prepared=gated.prepared
@@ -173,10 +172,9 @@ def _refined(
 ) -> tuple[_InHand, BlockSolution, Quality, Contradictions]:
     """Solutions without robust losses and gates by turns, until a gate changes nothing. whole: with all constraints
     that may take part; wrong: those that do not for the time being."""
-    rough = replace(options.solver, step_tolerance=max(options.solver.step_tolerance, _GATED_STEP))
     hand = whole.given(wrong.without(whole.block))
-    hand, solution, found = _rescaled(*_solved(hand, state, rough, solve), rough, solve)
-    solver, settled = rough, _SETTLED_SHARE * len(hand.block.observations)
+    hand, solution, found = _rescaled(*_solved(hand, state, options.solver, solve), options.solver, solve)
+    settled = _SETTLED_SHARE * len(hand.block.observations)
     for _ in range(_GATE_ROUNDS):
         every = replace(_scaled(whole.block, hand.scale / whole.scale), observations=hand.block.observations)
         again = agreeing(wrong, every, solution.state, found, options.gate_probability)
@@ -185,10 +183,8 @@ def _refined(
         dropped = len(hand.block.observations) - len(gated.block.observations)
         if more.failed.keys() == wrong.failed.keys() and dropped <= settled:
             break
-        wrong, solver = more, options.solver
-        hand, solution, found = _solved(gated, solution.state, solver, solve)
-    if solver is rough:
-        solution = solve(hand.block, options=options.solver, start=solution.state, prepared=hand.prepared)
+        wrong = more
+        hand, solution, found = _solved(gated, solution.state, options.solver, solve)
     return (*_rescaled(hand, solution, found, options.solver, solve), wrong)
 
 
