@@ -178,7 +178,6 @@ def test_an_image_whose_camera_was_estimated_keeps_its_localization_in_the_adjus
     assert np.trace(found.joint([0])) < 0.05 * np.trace(prior.cov)
 
 
-@pytest.mark.xfail(strict=True, reason="the solver takes a cost of 0 for one that no step improves")
 def test_an_epoch_of_unknown_cameras_alone_is_adjusted_by_its_pose_priors() -> None:
     found = adjusted(block(3, unknown=range(4)).problem)
     assert len(found.block.observations) == 0

@@ -66,6 +66,7 @@ def coherent_blocks(block: Block, system: ShiftSystem, *, reference_m: float = 0
     pieces = _joined(system, _wrong_pieces(system, _runs(system, shared, limit), shared, limit), limit)
     if not pieces:
         return CoherentSearch((), False)
+    pieces = _smaller_side(system, pieces, limit)
     shifts, cov, _ = _of_pieces(system, pieces).estimate(np.eye(len(pieces)))
     named = tuple(
         _named(block, system, piece, shifts[k], _own(cov, k, k), shared, limit) for k, piece in enumerate(pieces)
@@ -132,6 +133,31 @@ def _joined(system: ShiftSystem, pieces: list[Run], limit: float) -> list[Run]:
         else:
             k += 1
     return pieces
+
+
+def _smaller_side(system: ShiftSystem, pieces: list[Run], limit: float) -> list[Run]:
+    """The pieces, or all unnamed ones instead of those of one shift where that explains the residuals no worse and
+    names fewer: a shift of many against a datum that rests on a few looks the same from either side."""
+    grouped, last = _of_pieces(system, pieces, rest=True), len(pieces)
+    members, every = grouped.members, np.eye(len(pieces) + 1)
+    shifts, cov, explained = grouped.estimate(every[:, :last])
+    for k in range(last):
+        like = _like(shifts, cov, k, limit)
+        if members[:last][like].sum() <= members[last] or not members[last]:
+            continue
+        if grouped.estimate(every[:, np.append(~like, True)])[2] > explained - limit:
+            return sorted(
+                [piece for piece, same in zip(pieces, like, strict=True) if not same] + _unnamed(system, pieces)
+            )
+    return pieces
+
+
+def _unnamed(system: ShiftSystem, pieces: list[Run]) -> list[Run]:
+    """The runs between pieces, none across the ends of spans."""
+    cuts = sorted({end for run in (*pieces, *system.spans) for end in run})
+    inside = [any(begin <= a and b <= end for begin, end in pieces) for a, b in pairwise(cuts)]
+    spans = [any(begin <= a and b <= end for begin, end in system.spans) for a, b in pairwise(cuts)]
+    return [run for run, named, there in zip(pairwise(cuts), inside, spans, strict=True) if there and not named]
 
 
 def _undecidable(system: ShiftSystem, pieces: list[Run], limit: float) -> bool:

@@ -98,9 +98,8 @@ def _observations(problem: Problem) -> Observations:
 
 
 def _pose_priors(problem: Problem) -> PosePriors:
-    """Localized poses and given orientations of images."""
+    """Localized poses of images."""
     given = [(i, p.world_from_cam, p.cov, KINDS_OF_POSE.index("localized")) for i, p in problem.pose_priors.items()]
-    given += [(i, o.world_from_cam, o.cov, KINDS_OF_POSE.index("orientation")) for i, o in problem.orientations.items()]
     return PosePriors(
         np.array([row[0] for row in given], dtype=np.int64),
         Poses.of(row[1] for row in given),

@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 from georef.estimation.reference_errors import ReferenceErrors
 from georef.geometry.camera import Camera
-from georef.geometry.covariance import pose_cov_from_parts
 from georef.geometry.projection import Views
 from georef.geometry.rigid import Array, Rigid3
 from georef.geometry.triangulation import triangulate
@@ -22,24 +21,6 @@ from georef.types.constraints import ControlPoint
 from georef.types.scene import Observations
 
 _KNOWN_DEPTH = 0.1  # of its distance: a control point whose marks say less starts at its coordinates
-
-
-@dataclass(frozen=True, eq=False)
-class Orientation:
-    """A given exterior orientation of a reference image with uncorrelated position and rotation."""
-
-    world_from_cam: Rigid3
-    position_sigma_m: Array  # (3,) east, north, up
-    rotation_sigma_rad: Array  # (3,) about the camera axes
-
-    @property
-    def cov(self) -> Array:
-        """Covariance (6, 6), right perturbation."""
-        return pose_cov_from_parts(
-            self.world_from_cam,
-            np.diag(np.square(self.position_sigma_m)),
-            np.diag(np.square(self.rotation_sigma_rad)),
-        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,7 +75,6 @@ class Problem:
     points: Array  # (P, 3) tie points and automatic GCPs, approximate values
     observations: Observations  # of `points`
     gcps: AutomaticGcps = field(default_factory=AutomaticGcps.none)
-    orientations: Mapping[int, Orientation] = field(default_factory=dict)  # given, with uncertainty
     pose_priors: Mapping[int, PosePrior] = field(default_factory=dict)
     position_priors: Mapping[int, PositionPrior] = field(default_factory=dict)
     control: tuple[ControlPoint, ...] = ()
@@ -102,8 +82,6 @@ class Problem:
     def __post_init__(self) -> None:
         if not all(isinstance(point, ControlPoint) for point in self.control):
             raise TypeError("only control points can take part in an adjustment")
-        if set(self.orientations) & set(self.pose_priors):
-            raise ValueError("an image has either a given exterior orientation or a pose prior")
 
     def restricted(self, observations: NDArray[np.bool_], gcps: NDArray[np.bool_]) -> Problem:
         """Only the observations and automatic GCPs to keep, and the points that these still determine."""

@@ -227,7 +227,8 @@ class Minimizer:
                 return None
             raise self._singular(error, state) from None
         gained = before - moved.cost
-        lost = abs(promised) <= _ROUNDING * before and abs(gained) <= _ROUNDING * before
+        small = _ROUNDING * max(before, 1.0)  # whitened squares: far less than one residual
+        lost = abs(promised) <= small and abs(gained) <= small
         ratio = 1.0 if lost else (gained / promised if promised > 0.0 else -1.0)
         return _Trial(step, moved.state, moved.cost, float(ratio), moved.hidden)
 
