@@ -73,7 +73,8 @@ def gnss_pairs(
 def control_pairs(
     control: Sequence[ControlPoint], images: Sequence[Image], localized: Sequence[Localized], origin: Origin
 ) -> Paired | None:
-    """Control points by forward intersection from localized poses and by survey; None where there are none."""
+    """Control points of which all coordinates are known, by forward intersection from localized poses and by survey;
+    None where there are none."""
     covs = [found.world_from_cam_cov for found in localized]
     posed = PosedImages(
         tuple(found.image_id for found in localized),
@@ -82,7 +83,7 @@ def control_pairs(
         lambda indices: np.asarray(block_diag(*(covs[i] for i in indices)), dtype=np.float64),
     )
     first, second, sigma = [], [], []
-    for point in control:
+    for point in (p for p in control if p.partial is None):
         given = CheckPoint(point.point_id, CheckKind.ABSOLUTE, point.point_in_world, point.cov, point.marks)
         found = intersect(given, posed)
         if isinstance(found, str) or posed.joint_cov is None:
