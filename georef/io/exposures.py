@@ -31,8 +31,8 @@ def read_exposures(
     table_format: TableFormat | None = None,
     flight: str | None = None,
 ) -> Exposures:
-    """Read the column `time` or `time_s` (seconds, or dates and times by ISO 8601, UTC where they name no zone) and that
-    which `flight` names. Raises InputError."""
+    """Read the column `time` or `time_s`, seconds or dates and times by ISO 8601 (UTC where they name no zone), and
+    the one that `flight` names. Raises InputError."""
     table = read_table(path, columns=columns, table_format=table_format)
     name = next((name for name in _TIMES if table.has(name)), None)
     times = None if name is None else np.array([_seconds(table, name, i, t) for i, t in enumerate(table.ids(name))])
