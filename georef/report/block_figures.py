@@ -44,7 +44,7 @@ def plan_figure(plan: dict[str, Any], points: str, what: str, *, gnss: bool = Fa
     if ellipses:
         _ellipses(drawing, frame, stations)
     drawing.dots([frame.at(s["position_m"]) for s in stations], "stations")
-    longest = max((float(np.hypot(*v)) for _, v in vectors), default=0.0)
+    longest = max((float(np.hypot(v[0], v[1])) for _, v in vectors), default=0.0)
     factor = _LONGEST / longest if longest > 0 else 0.0
     for place, vector in vectors:
         x, y = frame.at(place)

@@ -19,7 +19,6 @@ from georef.crs import CrsDefinition, crs_kind
 from georef.errors import ConfigError
 from georef.geometry.camera import Camera
 from georef.io.camera_table import CAMERA_COLUMNS
-from georef.io.declarations import normalized_crs
 from georef.io.files import write_text_atomically
 from georef.io.pix4d import GIVEN_COLUMNS, read_pix4d_adjusted, read_pix4d_poses
 from georef.project import ProjectFile
@@ -75,7 +74,7 @@ def init_block(
             f"In {found.data}.",
         )
     crs_kind(CrsDefinition(crs, height))
-    text, cameras, said = block_text(found, name or found.data.name, normalized_crs(crs), height)
+    text, cameras, said = block_text(found, name or found.data.name, crs, height)
     validated(ProjectFile, tomllib.loads(text), str(path))
     write_cameras(cameras, path.parent)
     write_text_atomically(text, path)
