@@ -55,7 +55,7 @@ def _generated(seed: int) -> BalProblem:
     inner = np.column_stack([rng.uniform(900.0, 1100.0, count), np.full(count, -0.05), np.full(count, 0.01)])
     cameras = np.concatenate([turn, shift, inner], axis=1)
     camera, point = (index.ravel() for index in np.indices((count, len(points))))
-    seen = rng.random(len(camera)) < 0.5
+    seen = (rng.random(len(camera)) < 0.5) | (camera % 6 == 0)  # two cameras see all
     camera, point = camera[seen], point[seen]
     xy = _pixels(cameras[camera], points[point]) + 0.7 * rng.normal(size=(len(camera), 2))
     off = rng.normal(size=cameras.shape) * [*[0.01] * 3, *[0.1] * 3, 20.0, 0.01, 0.002]
