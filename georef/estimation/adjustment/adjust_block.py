@@ -29,7 +29,7 @@ from georef.estimation.adjustment.readmission import agreeing
 from georef.estimation.adjustment.solver import BlockSolution, Solve, SolverOptions, solve_block
 
 _GATE_ROUNDS, _ROBUST_ROUNDS = 4, 2
-_ROBUST_COST_TOLERANCE = 1e-3  # reweighting converges slowly, and gates need no more
+_ROBUST_COST_TOLERANCE = 1e-5  # a looser one leaves gates that differ from those of an updated adjustment
 _FAR_OFF = 1.25  # of a sigma against its residuals
 _SETTLED_SHARE = 1e-4  # of the observations: a gate that drops fewer changes nothing
 _FACTOR_TOLERANCE = 0.05
