@@ -31,7 +31,7 @@ from georef.estimation.adjustment.solver import BlockSolution, Solve, SolverOpti
 _GATE_ROUNDS, _ROBUST_ROUNDS = 4, 2
 _ROBUST_COST_TOLERANCE = 1e-5  # a looser one leaves gates that differ from those of an updated adjustment
 _FAR_OFF = 1.25  # of a sigma against its residuals
-_SETTLED_SHARE = 1e-4  # of the observations: a gate that drops fewer changes nothing
+SETTLED_SHARE = 1e-4  # of the observations: a gate that drops fewer changes nothing
 _FACTOR_TOLERANCE = 0.05
 _GROSS = 1e-3  # share of the false alarms of a gate that the first one may give: a robust solution is not the best one
 
@@ -84,7 +84,7 @@ class _InHand:
         return replace(self, block=block, prepared=self.prepared.restricted(block))
 
     def scaled(self, factor: float) -> _InHand:
-        return replace(self.given(_scaled(self.block, factor)), scale=self.scale * factor)
+        return replace(self.given(scaled_images(self.block, factor)), scale=self.scale * factor)
 
     def gated(self, found: Quality, probability: float) -> _InHand:
         """Without image observations that contradict the rest."""
@@ -174,9 +174,9 @@ def _refined(
     that may take part; wrong: those that do not for the time being."""
     hand = whole.given(wrong.without(whole.block))
     hand, solution, found = _rescaled(*_solved(hand, state, options.solver, solve), options.solver, solve)
-    settled = _SETTLED_SHARE * len(hand.block.observations)
+    settled = SETTLED_SHARE * len(hand.block.observations)
     for _ in range(_GATE_ROUNDS):
-        every = replace(_scaled(whole.block, hand.scale / whole.scale), observations=hand.block.observations)
+        every = replace(scaled_images(whole.block, hand.scale / whole.scale), observations=hand.block.observations)
         again = agreeing(wrong, every, solution.state, found, options.gate_probability)
         more = wrong.joined(every, found.constraints, options.gate_probability).readmitted(again)
         gated = hand.given(more.without(every)).gated(found, options.gate_probability)
@@ -204,10 +204,14 @@ def _rescaled(
     return _solved(hand.scaled(factor), solution.state, solver, solve)
 
 
-def _scaled(block: Block, factor: float) -> Block:
-    """The block with the sigmas of all keypoints scaled, those behind the automatic GCPs included."""
-    priors = block.point_priors
+def scaled_images(block: Block, factor: float) -> Block:
+    """The block with the sigmas of all keypoints scaled, those behind the automatic GCPs included; marks of control
+    points are measured by other means and keep theirs."""
+    priors, obs = block.point_priors, block.observations
+    marked = np.zeros(len(block.points), bool)
+    marked[priors.point[priors.kind == KINDS_OF_POINT.index("control")]] = True
     automatic = priors.kind == KINDS_OF_POINT.index("automatic")
     weight = np.where(automatic, factor**-2, 1.0)[:, None, None]
     given = replace(priors, information=priors.information * weight)
-    return replace(block, observations=block.observations.scaled(factor), point_priors=given)
+    scaled = replace(obs, sigma_px=obs.sigma_px * np.where(marked[obs.point], 1.0, factor))
+    return replace(block, observations=scaled, point_priors=given)

@@ -14,11 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from georef.estimation.adjustment.adjust_block import (
-    _SETTLED_SHARE,
+    SETTLED_SHARE,
     AdjustedBlock,
     BlockOptions,
     Quality,
-    _scaled,
+    scaled_images,
     adjust_block,
     quality,
 )
@@ -68,7 +68,7 @@ def updated(standing: Standing, given: Block, options: BlockOptions, solve: Solv
     GeorefError where the constraints leave the datum open.
     """
     out = {(r.kind, r.name) for r in standing.rejected} | standing.coherent
-    block = without_constraints(_scaled(given, standing.sigma_scale), out)
+    block = without_constraints(scaled_images(given, standing.sigma_scale), out)
     block = replace(block, observations=block.observations.take(standing.passed(block)))
     new = _New.of(standing, block)
     start = standing.start(block)
@@ -144,7 +144,7 @@ def _settled(
         more = _contradicting(standing, block, new, found, options.gate_probability)
         obs = block.observations
         bad = found.images.rejected(options.gate_probability, found.images.scale) & new.points[obs.point]
-        if not more and bad.sum() <= _SETTLED_SHARE * len(given.observations):
+        if not more and bad.sum() <= SETTLED_SHARE * len(given.observations):
             break
         block = without_constraints(block, {(r.kind, r.name) for r in more})
         block = replace(block, observations=obs.take(~bad))
