@@ -112,3 +112,16 @@ def test_what_a_small_step_promises_it_keeps(losses: dict[str, float]) -> None:
     promised = promised_decrease(lin, step, damping, moved)
     assert promised > 1e-5 * lin.cost
     assert (lin.cost - moved.cost) / promised == pytest.approx(1.0, abs=2e-3)
+
+
+def test_points_follow_the_border() -> None:
+    """After a full step near the solution gradients of points vanish but for curvature: calibrations moved them too."""
+    block = rig_block(1, disturbed=0.01).block
+    equations, state = BlockEquations(block), block.start()
+    lin = equations.linearized(state, 0.0)
+    none = np.zeros(lin.reduced.layout.size)
+    step = -ReducedFactor.of(lin.reduced, equations.pattern, none).solve(lin.reduced.gradient)
+    moved = equations.moved(state, step, 0.0)
+    assert equations.linearized(moved.state, 0.0).gain < 1e-4 * lin.gain
+    promised = promised_decrease(lin, step, 0.0, moved)
+    assert (lin.cost - moved.cost) / promised == pytest.approx(1.0, abs=1e-2)

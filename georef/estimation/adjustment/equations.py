@@ -105,7 +105,7 @@ class BlockEquations:
         prepared = self._prepared
         cost, hidden, squares = move_points(
             *(prepared.tracks, prepared.images, prepared.pairs, placed(state), placed(after), state.points, damping),
-            *(self._image_scale, HIDDEN_SQUARE, step, self._back, after.points),
+            *(self._image_scale, HIDDEN_SQUARE, step, self._back, after.points, self._work),
         )
         cost += constraint_cost(self._block, after, self.layout, self._losses)
         return Moved(after, float(cost), int(hidden), float(squares))

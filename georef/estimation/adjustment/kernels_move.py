@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from georef.estimation.adjustment.batches import BATCH
 from georef.estimation.adjustment.kernels import kernel, lens
-from georef.estimation.adjustment.kernels_points import loss
+from georef.estimation.adjustment.kernels_points import linearize, loss, share
 
 
 @kernel
-def move_points(tracks, images, pairs, placed, moved, points, damping, cauchy, hidden_square, step, back, moved_points):
+def move_points(
+    tracks, images, pairs, placed, moved, points, damping, cauchy, hidden_square, step, back, moved_points, work
+):
     """Fills moved_points (P, 3) by back-substitution of step (6 S + B,), which leads from `placed` to `moved`; `back`
     is of the elimination at `placed` with this damping.
 
@@ -16,17 +18,45 @@ def move_points(tracks, images, pairs, placed, moved, points, damping, cauchy, h
     shows, how many those are, and the sum of the squared steps of points times the diagonal of their normal matrices.
     """
     cost, hidden, squares = 0.0, 0, 0.0
+    border = step.shape[0] > 6 * placed.rig_rotation.shape[0]
     for begin in range(0, tracks.point.shape[0], BATCH):
         end = min(begin + BATCH, tracks.point.shape[0])
-        squares += _move(tracks, begin, end, images, pairs.slot, placed, points, damping, step, back, moved_points)
+        slope = work.slots.slope
+        slope[: pairs.slot[end] - pairs.slot[begin]] = 0.0
+        if border:
+            linearize(tracks, begin, end, images, placed, points, cauchy, work.rays, work.slots)
+            share(tracks, begin, end, images, placed, work.rays)
+            _pull(tracks.start[end] - tracks.start[begin], 6 * placed.rig_rotation.shape[0], step, work.rays, slope)
+        squares += _move(
+            tracks, begin, end, images, pairs.slot, placed, points, damping, step, back, slope, moved_points
+        )
         more, unseen = _cost(tracks, begin, end, images, moved, moved_points, cauchy, hidden_square)
         cost, hidden = cost + more, hidden + unseen
     return cost, hidden, squares
 
 
 @kernel
-def _move(tracks, begin, end, images, slot, placed, points, damping, step, back, moved_points):
-    """Points after the step; the sum of their squared steps times the diagonal of their normal matrices."""
+def _pull(count, unknown, step, rays, slope):
+    """Adds to G'r of each slot what the step of the border changes of it."""
+    for o in range(count):
+        s = rays.slot[o]
+        if s < 0:
+            continue
+        u, v = 0.0, 0.0
+        for a in range(rays.columns[o]):
+            change = step[unknown + rays.column[o, a]]
+            u += rays.shared[o, 0, a] * change
+            v += rays.shared[o, 1, a] * change
+        for i in range(3):
+            slope[s, i] += rays.by_rig[o, 0, i] * u + rays.by_rig[o, 1, i] * v
+
+
+@kernel
+def _move(tracks, begin, end, images, slot, placed, points, damping, step, back, slope, moved_points):
+    """Points after the step; the sum of their squared steps times the diagonal of their normal matrices.
+
+    slope: what the border's step changes of G'r of the batch's slots.
+    """
     r, t, unknown, squares = placed.rig_rotation, placed.rig_translation, 6 * placed.rig_rotation.shape[0], 0.0
     for track in range(begin, end):
         point, kept = tracks.point[track], tracks.kept[track]
@@ -49,9 +79,10 @@ def _move(tracks, begin, end, images, slot, placed, points, damping, step, back,
             v = z * step[k] - x * step[k + 2] - step[k + 4]
             w = x * step[k + 1] - y * step[k] - step[k + 5]
             q = back.square
-            a = q[m, 0] * u + q[m, 1] * v + q[m, 2] * w
-            b = q[m, 1] * u + q[m, 3] * v + q[m, 4] * w
-            c = q[m, 2] * u + q[m, 4] * v + q[m, 5] * w
+            n = m - slot[begin]
+            a = q[m, 0] * u + q[m, 1] * v + q[m, 2] * w + slope[n, 0]
+            b = q[m, 1] * u + q[m, 3] * v + q[m, 4] * w + slope[n, 1]
+            c = q[m, 2] * u + q[m, 4] * v + q[m, 5] * w + slope[n, 2]
             wx += r[s, 0, 0] * a + r[s, 1, 0] * b + r[s, 2, 0] * c
             wy += r[s, 0, 1] * a + r[s, 1, 1] * b + r[s, 2, 1] * c
             wz += r[s, 0, 2] * a + r[s, 1, 2] * b + r[s, 2, 2] * c
