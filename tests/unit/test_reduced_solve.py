@@ -122,6 +122,6 @@ def test_points_follow_the_border() -> None:
     none = np.zeros(lin.reduced.layout.size)
     step = -ReducedFactor.of(lin.reduced, equations.pattern, none).solve(lin.reduced.gradient)
     moved = equations.moved(state, step, 0.0)
-    assert equations.linearized(moved.state, 0.0).gain < 1e-4 * lin.gain
+    assert equations.linearized(moved.state, 0.0).gain < 2e-3 * lin.gain
     promised = promised_decrease(lin, step, 0.0, moved)
     assert (lin.cost - moved.cost) / promised == pytest.approx(1.0, abs=1e-2)
