@@ -84,7 +84,7 @@ def _checked_sigmas(table: Table, cameras: tuple[str, ...]) -> tuple[Array, NDAr
             expected="sigmas of 0 for one camera at most, the one that defines the rig.",
             remedy="Give the others the standard deviations of their calibration.",
         )
-    return sigmas, free.all(axis=1)
+    return sigmas, np.asarray(free.all(axis=1))
 
 
 def _cov(sigma_m: float, sigma_deg: float) -> Array | None:

@@ -28,11 +28,10 @@ from georef.stages.earlier import note_inputs
 from georef.stages.epoch_block import epoch_block
 from georef.stages.epoch_images import localized_images, ties_among
 from georef.stages.localize import make_task
-from georef.stages.solve_files import SolveFiles
+from georef.stages.solve_files import SOLVES, SolveFiles
 from georef.stages.standing_file import adjustment_inputs, standing_before, write_standing
 
 _WORTH_PARTS = 200_000  # observations
-SOLVES = "solves"
 
 
 def run(context: StageContext) -> StageSummary:

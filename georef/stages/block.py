@@ -19,7 +19,6 @@ from georef.estimation.adjustment.block_correlations import (
     shared_unknowns,
     strong_correlations,
 )
-from georef.estimation.adjustment.block_quality import CONTROL
 from georef.estimation.adjustment.block_solutions import (
     CleanBlock,
     Solved,
@@ -28,6 +27,9 @@ from georef.estimation.adjustment.block_solutions import (
     solved,
     without_offset,
 )
+from georef.estimation.adjustment.checkpoints import Resumable
+from georef.estimation.adjustment.solution_quality import CONTROL
+from georef.estimation.adjustment.solver import solve_block
 from georef.io.files import write_text_atomically
 from georef.project import Project
 from georef.report.block_page import render_block
@@ -41,6 +43,7 @@ from georef.stages.block_pictures import picture_numbers
 from georef.stages.block_state import block_inputs
 from georef.stages.block_survey import BlockSurvey, load_block
 from georef.stages.block_words import text_of
+from georef.stages.solve_files import SOLVES, SolveFiles
 from georef.types.constraints import CheckPoint, ControlPoint
 
 REPORT, TEXT, PAGE, POSES, CAMERAS = "report.json", "report.txt", "report.html", "poses.csv", "cameras.csv"
@@ -59,18 +62,20 @@ class BlockRun:
 def run(project: Project, name: str, say: Say = lambda _: None) -> BlockRun:
     """Adjusts a block as the project declares it, and again for each other choice of control points that it asks for.
 
-    Raises InputError, CrsError, GeorefError.
+    Interrupted, it goes on from its last iteration. Raises InputError, CrsError, GeorefError.
     """
     meter, survey = Meter(), load_block(project, name)
     config, section = project.config.adjust, project.file.blocks[name]
     datum = () if survey.has_gnss else survey.control(survey.declared_control)
-    cleaned = clean(survey.block, config, say, datum=datum)
+    kept = SolveFiles(project.published(name) / SOLVES)
+    solve = Resumable(kept, solve_block)
+    cleaned = clean(survey.block, config, say, datum=datum, solve=solve)
     say("solution as declared")
-    final = solve_with_control(cleaned, *_split(survey, survey.declared_control), config)
+    final = solve_with_control(cleaned, *_split(survey, survey.declared_control), config, solve)
     solutions = {"as declared": final}
     for title, control in _other_controls(survey).items():
         say(f"solution with {title}")
-        solutions[title] = solve_with_control(cleaned, *_split(survey, control), config)
+        solutions[title] = solve_with_control(cleaned, *_split(survey, control), config, solve)
     report: dict[str, Any] = {
         "georef": __version__,
         "project": project.file.name,
@@ -89,7 +94,9 @@ def run(project: Project, name: str, say: Say = lambda _: None) -> BlockRun:
         report["comparisons"] = comparisons(project, section.compare, final)
     report["figures"] = picture_numbers(survey, final, solutions.get("all control"))
     report["timing"] = meter.read()
-    return _published(project, name, survey, final, report)
+    done = _published(project, name, survey, final, report)
+    kept.clear()
+    return done
 
 
 def _split(survey: BlockSurvey, control: Sequence[str]) -> tuple[tuple[ControlPoint, ...], tuple[CheckPoint, ...]]:

@@ -18,6 +18,8 @@ from georef.geometry.poses import Poses
 from georef.io.items import camera_of, item_path, read_item, write_item
 
 _log = logging.getLogger(__name__)
+SOLVES = "solves"
+"""Name of the folder, beside what is made of them."""
 
 
 @dataclass(frozen=True)

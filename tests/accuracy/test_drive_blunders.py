@@ -90,8 +90,8 @@ def test_good_ones_stay(case: _Case) -> None:
     _check(points, automatic & ~wrong.points, automatic & wrong.points)
     assert points[~automatic].sum() <= 1
     _check(~np.isin(given.pose_priors.image, left.pose_priors.image), ~wrong.poses, wrong.poses)
-    pairs = [obs.point * len(given.image_ids) + obs.view for obs in (given.observations, left.observations)]
-    dropped = ~np.isin(*pairs)
+    before, after = (obs.point * len(given.image_ids) + obs.view for obs in (given.observations, left.observations))
+    dropped = ~np.isin(before, after)
     assert dropped[~wrong.observations].mean() <= 0.01
     assert dropped[wrong.observations].mean() >= 0.9  # one of two rays is as good as the other
     assert len(given.position_priors) - len(left.position_priors) <= 1

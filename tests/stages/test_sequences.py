@@ -29,7 +29,7 @@ def to_stations(bench: Bench, executor: Executor | None = None, *settings: str) 
 
 
 def outcomes(result: StageResult) -> list[Outcome]:
-    return read_outcomes(result.context.folder, result.context.survey.epoch)
+    return list(read_outcomes(result.context.folder, result.context.survey.epoch))
 
 
 def test_no_stage_where_nothing_belongs_together(finished: Bench) -> None:

@@ -9,8 +9,10 @@ import numpy as np
 import pytest
 
 from georef.cli import app
+from georef.estimation.adjustment.checkpoints import Reached
 from georef.io.bal import BalProblem, read_bal, write_bal
 from georef.io.poses import read_poses
+from georef.stages.solve_files import SOLVES, SolveFiles
 from georef.terminal import exit_code
 from tests.worlds.aerial import flight, write_flight
 
@@ -54,6 +56,35 @@ def test_the_offset_of_the_positions_is_found_in_two_ways(adjusted: Path) -> Non
     for unknown, truth in zip(estimated, _OFFSET, strict=True):
         assert abs(abs(unknown["value"]) - abs(truth)) < 4.0 * unknown["sigma"]
         assert 0.001 < unknown["sigma"] < 0.1
+
+
+def test_an_interrupted_block_goes_on(adjusted: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Stopped in the middle of its solves, it repeats none of their iterations and ends at the same numbers."""
+    written: list[str] = []
+    write = SolveFiles.write
+
+    def stopping(self: SolveFiles, key: str, reached: Reached) -> None:
+        write(self, key, reached)
+        written.append(key)
+        if len(written) == 9:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(SolveFiles, "write", stopping)
+    command = ["adjust", str(adjusted.parents[2]), "-o", str(tmp_path)]
+    assert exit_code(app, command) != 0
+    solves = tmp_path / "epochs" / "flight" / SOLVES
+    assert len(list(solves.iterdir())) == len(set(written)) > 1
+    done, again = set(written[:-1]) - {written[-1]}, len(written)
+    assert exit_code(app, command) == 0
+    assert not done & set(written[again:])
+    assert not solves.exists()
+    first, second = (json.loads((f / "report.json").read_text(encoding="utf-8")) for f in (adjusted, solves.parent))
+    for report in (first, second):
+        del report["timing"]
+    assert second["data"] == first["data"]
+    assert second["variants"]["all control"]["control_residuals_m"] == [
+        pytest.approx(row, abs=1e-9) for row in first["variants"]["all control"]["control_residuals_m"]
+    ]
 
 
 def test_splits_agree_with_an_adjustment(adjusted: Path) -> None:

@@ -43,7 +43,7 @@ def test_images_held_upside_down_come_out_right(
     _upside_down(bench.data)
     shutil.rmtree(bench.output / "epochs")
     results = bench.run(_TURN_BACK)
-    outcomes = read_outcomes(results["localize"].context.folder, results["localize"].context.survey.epoch)
+    outcomes = list(read_outcomes(results["localize"].context.folder, results["localize"].context.survey.epoch))
     store = open_features(results["adjust"].context.before["store"])
     adjusted = read_adjusted(results["adjust"].context.folder)
     assert len(adjusted.image_ids) == len(outcomes) == 3

@@ -76,7 +76,7 @@ def _same(a: State, b: State, tolerance: float = 0.0) -> bool:
     moved = np.concatenate([np.abs(x.local(y)).ravel() for x, y in _poses(a, b)])
     points = np.abs(a.points - b.points).max()
     cameras = all(abs(x.fx - y.fx) <= 1e3 * tolerance for x, y in zip(a.cameras, b.cameras, strict=True))
-    return bool(moved.max() <= max(tolerance, 1e-15) and points <= tolerance and cameras)
+    return bool(moved.max() <= max(tolerance, 1e-13) and points <= tolerance and cameras)
 
 
 def _poses(a: State, b: State) -> list[tuple[Poses, Poses]]:

@@ -29,12 +29,13 @@ def _with_gcps(block: Block, truth: State, seed: int, count: int = 24) -> Block:
     root = _SIGMA_M * (np.eye(3) + 0.5 * rng.normal(size=(count, 3, 3)))
     position = truth.points[point] + np.einsum("kij,kj->ki", root, rng.normal(size=(count, 3)))
     given, names = block.point_priors, tuple(f"A{i}" for i in range(count))
+    weight = np.asarray(np.linalg.inv(root @ np.swapaxes(root, 1, 2)), dtype=np.float64)
     return replace(
         block,
         point_priors=PointPriors(
             np.concatenate([given.point, point]),
             np.concatenate([given.position, position]),
-            np.concatenate([given.information, np.linalg.inv(root @ np.swapaxes(root, 1, 2))]),
+            np.concatenate([given.information, weight]),
             np.concatenate([given.kind, np.ones(count, np.int64)]),
             (*given.point_ids, *names),
         ),

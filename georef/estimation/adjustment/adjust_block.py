@@ -159,7 +159,8 @@ def _without_wrong(
         probability=options.gate_probability,
         reference_m=options.reference_m,
     )
-    named = dict(zip(("pose_priors", "point_priors"), named_rows(hand.block, search), strict=True))
+    poses, points = named_rows(hand.block, search)
+    named = {"pose_priors": poses, "point_priors": points}
     return hand.given(without_named(hand.block, search)), state, search, wrong.in_the_rest(named)
 
 

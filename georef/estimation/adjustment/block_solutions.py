@@ -21,7 +21,7 @@ from georef.estimation.adjustment.block_gates import RejectedConstraint
 from georef.estimation.adjustment.cofactors import Cofactors
 from georef.estimation.adjustment.prepared import Prepared
 from georef.estimation.adjustment.problem import mark_observations
-from georef.estimation.adjustment.solver import BlockSolution, SolverOptions, solve_block
+from georef.estimation.adjustment.solver import BlockSolution, Solve, SolverOptions, solve_block
 from georef.geometry.rigid import Array
 from georef.types.constraints import CheckPoint, ControlPoint
 from georef.types.scene import Observations
@@ -88,19 +88,25 @@ def options_of(config: AdjustConfig) -> BlockOptions:
 
 
 def clean(
-    block: Block, config: AdjustConfig, say: Say = lambda _: None, *, datum: Sequence[ControlPoint] = ()
+    block: Block,
+    config: AdjustConfig,
+    say: Say = lambda _: None,
+    *,
+    datum: Sequence[ControlPoint] = (),
+    solve: Solve = solve_block,
 ) -> CleanBlock:
     """Finds and removes what contradicts the rest, and the sigma of the image observations that are left.
 
     datum: control points that help, where nothing else says where the block is; they are not part of what is left. A
     plain solution comes first: robust losses want approximate values that are not far off, calibrations included.
-    Raises GeorefError where the constraints leave the datum open.
+    solve: how solves are done, here and below, such as `checkpoints.Resumable`. Raises GeorefError where constraints
+    leave the datum open.
     """
     say("first solution")
     given = with_control(block, datum)
-    first = solve_block(given, options=SolverOptions(config.max_iterations, cost_tolerance=_APPROXIMATE))
+    first = solve(given, options=SolverOptions(config.max_iterations, cost_tolerance=_APPROXIMATE))
     say("robust solution, gates, solution without what was rejected")
-    found = adjust_block(given, options_of(config), start=first.state)
+    found = adjust_block(given, options_of(config), start=first.state, solve=solve)
     kept, state = _without_last_points(found.block, found.solution.state, len(datum))
     marks = sum(len(point.marks) for point in datum)
     dropped = len(block.observations) - len(kept.observations)
@@ -111,25 +117,32 @@ def clean(
 
 
 def solve_with_control(
-    given: CleanBlock, control: Sequence[ControlPoint], check: Sequence[CheckPoint], config: AdjustConfig
+    given: CleanBlock,
+    control: Sequence[ControlPoint],
+    check: Sequence[CheckPoint],
+    config: AdjustConfig,
+    solve: Solve = solve_block,
 ) -> Solved:
     """Adjusts with some points as control, which pass gates; the others are intersected and take no part."""
     start = start_with(given.state, control)
     block = with_control(given.block, control)
     names = tuple(point.point_id for point in control)
     if not control:
-        return solved(block, start, check, config)
-    found = adjust_block(block, options_of(config), start=start)
+        return solved(block, start, check, config, solve)
+    found = adjust_block(block, options_of(config), start=start, solve=solve)
     checked = check_block(found.block, found.solution.state, found.quality.cofactors.apply, check)
     marks = rejected_marks(block, found, control)
     return Solved(found.block, found.solution, found.quality, checked, found.rejected, marks, names)
 
 
-def solved(block: Block, start: State, check: Sequence[CheckPoint], config: AdjustConfig) -> Solved:
+def solved(
+    block: Block, start: State, check: Sequence[CheckPoint], config: AdjustConfig, solve: Solve = solve_block
+) -> Solved:
     """Least-squares solution of a block as it is, with its quality. Raises GeorefError where there is none."""
     options = SolverOptions(config.max_iterations, cost_tolerance=_ENOUGH)
-    solution = solve_block(block, options=options, start=start, prepared=Prepared.of(block))
-    found = quality(block, solution.state)
+    prepared = Prepared.of(block)
+    solution = solve(block, options=options, start=start, prepared=prepared)
+    found = quality(block, solution.state, prepared)
     return Solved(block, solution, found, check_block(block, solution.state, found.cofactors.apply, check))
 
 

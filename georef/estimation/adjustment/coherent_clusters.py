@@ -7,6 +7,7 @@ points one by one; that they agree with each other says that they have one cause
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import cast
 
 import numpy as np
 from scipy.stats import chi2
@@ -41,7 +42,7 @@ class Offsets:
         row = np.flatnonzero((priors.kind == KINDS_OF_POINT.index(AUTOMATIC)) & (station >= 0))
         row = row[np.argsort(station[row], kind="stable")]
         point = priors.point[row]
-        own = np.linalg.inv(priors.information[row])
+        own = cast(Array, np.linalg.inv(priors.information[row]))
         return Offsets(row, station[row], priors.position[row] - state.points[point], own, own + points[point])
 
     @staticmethod
@@ -57,8 +58,8 @@ class Offsets:
         return Offsets(row, block.station[image], given.translation - adjusted.translation, own, own + place)
 
     def take(self, chosen: Indices) -> Offsets:
-        arrays = self.row, self.station, self.off_m, self.own, self.cov
-        return Offsets(*(array[chosen] for array in arrays))
+        arrays = self.off_m[chosen], self.own[chosen], self.cov[chosen]
+        return Offsets(self.row[chosen], self.station[chosen], *arrays)
 
     def squares(self, shift: Array | float = 0.0) -> Array:
         """Their statistics (K,), 3 degrees of freedom, with a shift taken off."""

@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 from typing import cast
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial import KDTree
 from scipy.stats import chi2
 
@@ -115,7 +116,7 @@ def _one_piece(a: CoherentBlock, b: CoherentBlock, block: Block, at: dict[str, i
 def _merged(a: CoherentBlock, b: CoherentBlock, block: Block) -> CoherentBlock:
     """Both as one, the shifts weighted."""
     weights = np.linalg.inv(a.cov), np.linalg.inv(b.cov)
-    cov = np.linalg.inv(weights[0] + weights[1])
+    cov = cast(Array, np.linalg.inv(weights[0] + weights[1]))
     points = np.union1d(a.points, b.points)
     return CoherentBlock(
         *(
@@ -177,7 +178,7 @@ def _squares(residual: Array, cov: Array) -> Array:
     return np.einsum("ki,ki->k", residual, np.linalg.solve(cov, residual[:, :, None])[:, :, 0])
 
 
-def _mask(rows: Indices, count: int) -> Array:
+def _mask(rows: Indices, count: int) -> NDArray[np.bool_]:
     out = np.zeros(count, bool)
     out[rows] = True
     return out

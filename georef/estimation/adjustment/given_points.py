@@ -11,6 +11,7 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.sparse import coo_array, csr_array
 
 from georef.estimation.adjustment.block import Block, Indices, State
@@ -48,7 +49,7 @@ class GivenRays:
         at = prior[obs.point]
         lin = linearize(block.views(state), obs.view, state.points[obs.point])
         residual = (lin.pixel - obs.pixel) / obs.sigma_px[:, None]
-        shown = np.isfinite(residual).all(axis=1)
+        shown: NDArray[np.bool_] = np.asarray(np.isfinite(residual).all(axis=1))
         residual = np.where(shown[:, None], residual, 0.0)
         scale = (losses or {}).get(IMAGE_OBSERVATIONS, 0.0)
         weight = (shown * robust_weight(np.sum(np.square(residual), axis=1), scale))[:, None, None]

@@ -97,9 +97,10 @@ def shift_system(
     across = cast(csc_array, hstack([part[0] for part in parts]).tocsc())
     own, right = (np.concatenate([part[i] for part in parts]) for i in (1, 2))
     turned: Any = csr_array(across.T)
-    information = np.zeros((across.shape[1], across.shape[1]))
-    for begin in range(0, across.shape[1], _CHUNK):
-        chunk = slice(begin, min(begin + _CHUNK, across.shape[1]))
+    count = right.size
+    information = np.zeros((count, count))
+    for begin in range(0, count, _CHUNK):
+        chunk = slice(begin, min(begin + _CHUNK, count))
         information[:, chunk] = -(turned @ found.apply(np.asarray(across[:, chunk].toarray())))
     at = np.arange(len(own))
     information.reshape(len(own), 3, len(own), 3)[at, :, at, :] += own

@@ -89,7 +89,7 @@ class ShiftSystem:
 
 def _wide(design: Any) -> Any:
     """(3 n, 3 k) of (n, k): the same for each coordinate."""
-    sets = csr_array(design).tocoo()
+    sets: Any = csr_array(design).tocoo()
     row, column = (3 * i[:, None] + np.arange(3) for i in sets.coords)
     values = np.repeat(sets.data, 3)
     return csr_array((values, (row.ravel(), column.ravel())), shape=(3 * sets.shape[0], 3 * sets.shape[1]))

@@ -18,9 +18,9 @@ from georef.estimation.adjustment.adjust_block import (
     AdjustedBlock,
     BlockOptions,
     Quality,
-    scaled_images,
     adjust_block,
     quality,
+    scaled_images,
 )
 from georef.estimation.adjustment.block import KINDS_OF_POINT, KINDS_OF_POSE, Block, PosePriors, State
 from georef.estimation.adjustment.block_gates import GATED, RejectedConstraint, name_of
