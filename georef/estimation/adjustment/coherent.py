@@ -27,7 +27,7 @@ _RUNS_A_SEGMENT = 10.0  # so many of the runs through a segment count as indepen
 _MOST_RUNS = 100
 _POWER = 0.8  # that a detectable shift is found with: 1 - beta0
 FEWEST_POINTS = 3  # one or two that are off are single blunders
-_LARGE_SHARE = 0.5  # of those that are left: so many of one other shift may be the right ones as well
+LARGE_SHARE = 0.5  # of those that are left: so many of one other shift may be the right ones as well
 Run = tuple[int, int]
 
 
@@ -168,7 +168,7 @@ def _undecidable(system: ShiftSystem, pieces: list[Run], limit: float) -> bool:
     shifts, cov, explained = grouped.estimate(every[:, :last])
     for k in range(last):
         like = _like(shifts, cov, k, limit)
-        if members[:last][like].sum() < _LARGE_SHARE * members[last]:
+        if members[:last][like].sum() < LARGE_SHARE * members[last]:
             continue
         other = grouped.estimate(every[:, np.append(~like, True)])[2]
         if other > explained - limit:

@@ -15,10 +15,11 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 from scipy.stats import chi2
 
-from georef.estimation.adjustment.block import KINDS_OF_POSE, Block, Indices, State
+from georef.estimation.adjustment.block import KINDS_OF_POINT, KINDS_OF_POSE, Block, Indices, State
 from georef.estimation.adjustment.cofactors import Cofactors
 from georef.estimation.adjustment.coherent import (
     FEWEST_POINTS,
+    LARGE_SHARE,
     CoherentBlock,
     CoherentSearch,
     references_of,
@@ -60,8 +61,9 @@ def settled(
 
     One that agrees with the rest after all, and better so than with the shift of its block, is let go; one that
     disagrees belongs to the block near by whose shift explains it best. A block of fewer points than a search would
-    name is none; contradicting points that belong to none may form one by themselves (`coherent_clusters`). block has
-    all priors; state, found and points (P, 3, 3), the cofactors, are those of the adjustment that lacks the named ones.
+    name, or of no significant shift, is none; contradicting points that belong to none may form one by themselves
+    (`coherent_clusters`). block has all priors; state, found and points (P, 3, 3), the cofactors, are those of the
+    adjustment that lacks the named ones.
     """
     offsets = Offsets.of_poses(block, state, found), Offsets.of_points(block, state, points)
     of_poses, of_points = _poses(block, state, found), _points(offsets[1])
@@ -75,10 +77,25 @@ def settled(
             point_owner[given] = -1
             continue
         members = offsets[0].take(mine) if len(mine) else offsets[1].take(given)
-        blocks.append(named(block, members, bool(len(mine)), reference_m**2, limit))
+        one = named(block, members, bool(len(mine)), reference_m**2, limit)
+        if one.statistic > limit:
+            blocks.append(one)
+        else:
+            point_owner[given] = -1
     alone = np.flatnonzero((point_owner < 0) & (offsets[1].squares() > chi2.isf(_CONTRADICTS, 3)))
     blocks += clusters(block, offsets[1].take(alone), reference_m**2, limit)
-    return CoherentSearch(tuple(_joined(blocks, block)), search.undecidable)
+    blocks = _joined(blocks, block)
+    tested = len(of_poses.row) + len(of_points.row)
+    return CoherentSearch(tuple(blocks), search.undecidable or _as_many(blocks, block, tested))
+
+
+def _as_many(blocks: list[CoherentBlock], block: Block, tested: int) -> bool:
+    """Whether about as many rows as are left agree in one shift, and nothing else says where the block is."""
+    control = block.point_priors.kind == KINDS_OF_POINT.index("control")
+    if not blocks or len(block.position_priors) or control.any():
+        return False
+    counts = [len(b.poses) + len(b.points) for b in blocks]
+    return max(counts) >= LARGE_SHARE * (tested - sum(counts))
 
 
 def _middle(wrong: CoherentBlock, poses: Offsets, points: Offsets) -> Array:
