@@ -88,8 +88,8 @@ def run_all(folder: Path, ceres: Iterable[Ceres], sizes: Iterable[Size] = SIZES)
 
 def _solve_ours(folder: Path, size: Size) -> dict[str, Any]:
     from georef.benchmarks.adjustment_parts import TimedEquations
-    from georef.estimation.adjustment.equations import BlockEquations
-    from georef.estimation.adjustment.prepared import Prepared
+    from georef.estimation.adjustment.equations.block_equations import BlockEquations
+    from georef.estimation.adjustment.equations.prepared import Prepared
     from georef.estimation.adjustment.solver import SolverOptions, solve_block
 
     options = SolverOptions(max_iterations=MAX_ITERATIONS, cost_tolerance=COST_TOLERANCE)
@@ -112,9 +112,9 @@ def _solve_ours(folder: Path, size: Size) -> dict[str, Any]:
 
 def _warm_up(folder: Path, size: Size, options: SolverOptions) -> None:
     """Compiles what is compiled, or loads it, with a small problem of the same kind."""
-    from georef.estimation.adjustment.eliminate import normal_equations
-    from georef.estimation.adjustment.prepared import Prepared
-    from georef.estimation.adjustment.reduced_solve import product
+    from georef.estimation.adjustment.equations.eliminate import normal_equations
+    from georef.estimation.adjustment.equations.prepared import Prepared
+    from georef.estimation.adjustment.equations.reduced_solve import product
     from georef.estimation.adjustment.solver import solve_block
 
     small = folder / "warm_up"

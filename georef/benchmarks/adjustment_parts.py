@@ -5,10 +5,10 @@ from __future__ import annotations
 import time
 
 from georef.estimation.adjustment.block import State
-from georef.estimation.adjustment.block_cholesky import Pattern
-from georef.estimation.adjustment.eliminate import Linearized
-from georef.estimation.adjustment.equations import Equations, Moved
-from georef.estimation.adjustment.reduced import Layout
+from georef.estimation.adjustment.equations.block_cholesky import Pattern
+from georef.estimation.adjustment.equations.block_equations import Equations, Moved
+from georef.estimation.adjustment.equations.eliminate import Linearized
+from georef.estimation.adjustment.equations.reduced import Layout
 from georef.geometry.rigid import Array
 
 

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from georef.config import AdjustConfig, NetworkConfig
 from georef.errors import StageError
 from georef.estimation.adjustment.block import Block
-from georef.estimation.adjustment.components import Component
 from georef.estimation.adjustment.network import AdjustedNetwork, adjust_network, network_block, worst_orientation
+from georef.estimation.adjustment.quality.components import Component
 from georef.estimation.guided import GuidedOptions, PosedFeatures, epipolar_band, guided_matches
 from georef.estimation.smooth_errors import Residuals, SmoothErrors, smooth_errors
 from georef.estimation.tracks import (

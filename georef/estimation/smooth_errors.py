@@ -23,7 +23,7 @@ from scipy.optimize import minimize
 from scipy.stats import chi2
 
 from georef.estimation.adjustment.block import Block, State
-from georef.estimation.adjustment.cofactors import Cofactors
+from georef.estimation.adjustment.equations.cofactors import Cofactors
 from georef.geometry.rigid import Array
 from georef.types.results import ReferenceNoise
 

@@ -10,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 from scipy.stats import chi2
 
-from georef.estimation.adjustment.group_tests import group_statistics
+from georef.estimation.adjustment.quality.group_tests import group_statistics
 from georef.estimation.tracks import nearest_ray_angles
 from georef.geometry.projection import Views, linearize
 from georef.geometry.rigid import Array

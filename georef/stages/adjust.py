@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 from georef.config import AdjustConfig
 from georef.estimation.adjustment.adjust_block import AdjustedBlock, BlockOptions, adjust_block
 from georef.estimation.adjustment.block import Block
-from georef.estimation.adjustment.checkpoints import Resumable
-from georef.estimation.adjustment.partitioned import Partitioned
+from georef.estimation.adjustment.campaign.checkpoints import Resumable
+from georef.estimation.adjustment.campaign.partitioned import Partitioned
+from georef.estimation.adjustment.campaign.standing import Standing, with_lasting_names
+from georef.estimation.adjustment.campaign.updating import updated
 from georef.estimation.adjustment.solver import Solve, SolverOptions, solve_block
-from georef.estimation.adjustment.standing import Standing, with_lasting_names
-from georef.estimation.adjustment.updating import updated
 from georef.estimation.epoch_problem import epoch_problem
 from georef.estimation.guided import PosedFeatures
 from georef.executor import Held

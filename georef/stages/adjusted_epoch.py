@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from georef.errors import StageError
 from georef.estimation.adjustment.adjust_block import AdjustedBlock
-from georef.estimation.adjustment.image_covariances import image_covariances
+from georef.estimation.adjustment.quality.image_covariances import image_covariances
 from georef.geometry.rigid import Array, Rigid3
 from georef.io.items import read_item, write_item
 from georef.stages.adjustment_report import scene_points

@@ -13,14 +13,14 @@ from numpy.typing import NDArray
 from georef.crs import WorldFrame
 from georef.estimation.adjustment.adjust_block import AdjustedBlock
 from georef.estimation.adjustment.block import KINDS_OF_POINT, KINDS_OF_POSE, Block, State
-from georef.estimation.adjustment.block_gates import RejectedConstraint
-from georef.estimation.adjustment.coherent import CoherentBlock
-from georef.estimation.adjustment.components import Component
-from georef.estimation.adjustment.constraint_terms import DISTANCES, POSITION_PRIORS, RELATIVE_POSES
-from georef.estimation.adjustment.correlations import shared_unknowns, strong_correlations
-from georef.estimation.adjustment.eliminate import IMAGE_OBSERVATIONS
-from georef.estimation.adjustment.reliability import NO_WEIGHT, Reliability, reliability
-from georef.estimation.adjustment.weak_focal import weak_focals
+from georef.estimation.adjustment.blunders.coherent import CoherentBlock
+from georef.estimation.adjustment.blunders.gates import RejectedConstraint
+from georef.estimation.adjustment.equations.constraint_terms import DISTANCES, POSITION_PRIORS, RELATIVE_POSES
+from georef.estimation.adjustment.equations.eliminate import IMAGE_OBSERVATIONS
+from georef.estimation.adjustment.quality.components import Component
+from georef.estimation.adjustment.quality.correlations import shared_unknowns, strong_correlations
+from georef.estimation.adjustment.quality.reliability import NO_WEIGHT, Reliability, reliability
+from georef.estimation.adjustment.quality.weak_focal import weak_focals
 from georef.geometry.rigid import Array
 from georef.stages.reliability_data import UNCHECKED, reliability_rows, reliability_summary
 

@@ -12,8 +12,8 @@ from scipy.stats import chi2
 
 from georef.crs import WorldFrame, crs_kind
 from georef.estimation.adjustment.adjust_block import AdjustedBlock
-from georef.estimation.adjustment.block_gates import RejectedConstraint
-from georef.estimation.adjustment.reliability import Reliability
+from georef.estimation.adjustment.blunders.gates import RejectedConstraint
+from georef.estimation.adjustment.quality.reliability import Reliability
 from georef.geometry.rigid import Array
 from georef.io.columns import POSITION_COLUMNS, CrsKind
 from georef.io.files import write_lines_atomically

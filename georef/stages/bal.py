@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from georef.estimation.adjustment.block import Block, Calibration, RigCamera
-from georef.estimation.adjustment.checkpoints import Resumable
+from georef.estimation.adjustment.campaign.checkpoints import Resumable
 from georef.estimation.adjustment.solver import Iteration, SolverOptions, solve_block
 from georef.geometry.rigid import Rigid3
 from georef.io.bal import BalProblem, read_bal, write_bal

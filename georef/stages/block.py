@@ -12,14 +12,16 @@ import numpy as np
 
 from georef import __version__
 from georef.config import AdjustConfig
-from georef.estimation.adjustment.block_check import common_offset
-from georef.estimation.adjustment.block_correlations import (
+from georef.estimation.adjustment.campaign.checkpoints import Resumable
+from georef.estimation.adjustment.measured.check import common_offset
+from georef.estimation.adjustment.measured.correlations import (
     Correlation,
     ground_height_correlations,
     shared_unknowns,
     strong_correlations,
 )
-from georef.estimation.adjustment.block_solutions import (
+from georef.estimation.adjustment.measured.solution_quality import CONTROL
+from georef.estimation.adjustment.measured.solutions import (
     CleanBlock,
     Solved,
     clean,
@@ -27,8 +29,6 @@ from georef.estimation.adjustment.block_solutions import (
     solved,
     without_offset,
 )
-from georef.estimation.adjustment.checkpoints import Resumable
-from georef.estimation.adjustment.solution_quality import CONTROL
 from georef.estimation.adjustment.solver import solve_block
 from georef.io.files import write_text_atomically
 from georef.project import Project

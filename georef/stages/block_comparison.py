@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from georef.errors import InputError
-from georef.estimation.adjustment.block_correlations import shared_unknowns
-from georef.estimation.adjustment.block_solutions import Solved
+from georef.estimation.adjustment.measured.correlations import shared_unknowns
+from georef.estimation.adjustment.measured.solutions import Solved
 from georef.evaluation.calibrations import compare_calibrations, difference_map
 from georef.geometry.camera import Camera
 from georef.io.pix4d import Pix4dPoses, read_pix4d_cameras, read_pix4d_poses

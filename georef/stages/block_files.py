@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from georef.estimation.adjustment.block_solutions import Solved
+from georef.estimation.adjustment.measured.solutions import Solved
 from georef.geometry.camera import Camera
 from georef.io.camera_table import CAMERA_COLUMNS, COEFFICIENT_COLUMNS
 from georef.io.files import write_text_atomically

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from georef.config import AdjustConfig
-from georef.estimation.adjustment.block_check import BlockCheck, with_points_as_control
-from georef.estimation.adjustment.block_solutions import CleanBlock, Solved, solved, start_with, with_control
+from georef.estimation.adjustment.measured.check import BlockCheck, with_points_as_control
+from georef.estimation.adjustment.measured.solutions import CleanBlock, Solved, solved, start_with, with_control
 from georef.evaluation.check_points import CheckPointErrors
 from georef.evaluation.splits import spread_splits
 from georef.evaluation.statistics import summarize_nees

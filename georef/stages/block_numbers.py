@@ -9,14 +9,18 @@ from typing import Any
 
 import numpy as np
 
-from georef.estimation.adjustment.block_check import check_block
-from georef.estimation.adjustment.block_correlations import shared_unknowns, strong_correlations
-from georef.estimation.adjustment.block_gates import RejectedConstraint
-from georef.estimation.adjustment.block_solutions import Solved
-from georef.estimation.adjustment.components import Component
-from georef.estimation.adjustment.constraint_terms import DISTANCES
-from georef.estimation.adjustment.reliability import DELTA0
-from georef.estimation.adjustment.solution_quality import control_quality, position_quality, variance_components
+from georef.estimation.adjustment.blunders.gates import RejectedConstraint
+from georef.estimation.adjustment.equations.constraint_terms import DISTANCES
+from georef.estimation.adjustment.measured.check import check_block
+from georef.estimation.adjustment.measured.correlations import shared_unknowns, strong_correlations
+from georef.estimation.adjustment.measured.solution_quality import (
+    control_quality,
+    position_quality,
+    variance_components,
+)
+from georef.estimation.adjustment.measured.solutions import Solved
+from georef.estimation.adjustment.quality.components import Component
+from georef.estimation.adjustment.quality.reliability import DELTA0
 from georef.evaluation.statistics import finite, finite_list
 from georef.geometry.rigid import Array
 from georef.types.constraints import CheckKind, CheckPoint, ControlPoint

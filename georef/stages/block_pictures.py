@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from georef.estimation.adjustment.block_solutions import Solved, residuals_px
-from georef.estimation.adjustment.constraint_terms import drift_at
+from georef.estimation.adjustment.equations.constraint_terms import drift_at
+from georef.estimation.adjustment.measured.solutions import Solved, residuals_px
 from georef.geometry.rigid import Array
 from georef.stages.block_survey import BlockSurvey
 

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 
 from georef.errors import InputError
-from georef.estimation.datum_pairs import CONTROL, GNSS, Origin, contradiction, control_pairs, gnss_pairs
-from georef.estimation.datum_sentinel import DatumReport, Finding, Paired, compare_datums
+from georef.estimation.datum.pairs import CONTROL, GNSS, Origin, contradiction, control_pairs, gnss_pairs
+from georef.estimation.datum.sentinel import DatumReport, Finding, Paired, compare_datums
 from georef.geometry.rigid import Array
 from georef.stages.base import StageContext
 from georef.types.campaign import Image

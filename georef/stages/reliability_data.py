@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from scipy.stats import chi2
 
-from georef.estimation.adjustment.reliability import ALPHA0, BETA0, DELTA0, Reliability
+from georef.estimation.adjustment.quality.reliability import ALPHA0, BETA0, DELTA0, Reliability
 from georef.geometry.rigid import Array
 
 UNCHECKED = 0.01

@@ -11,7 +11,7 @@ import numpy as np
 
 from georef.errors import StageError
 from georef.estimation.adjustment.block import State
-from georef.estimation.adjustment.checkpoints import Reached
+from georef.estimation.adjustment.campaign.checkpoints import Reached
 from georef.estimation.adjustment.solver import BlockSolution
 from georef.geometry.camera import Camera
 from georef.geometry.poses import Poses

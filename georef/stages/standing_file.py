@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from georef.estimation.adjustment.block_gates import RejectedConstraint
-from georef.estimation.adjustment.standing import Standing
+from georef.estimation.adjustment.blunders.gates import RejectedConstraint
+from georef.estimation.adjustment.campaign.standing import Standing
 from georef.geometry.poses import Poses
 from georef.io.items import camera_of, item_path, read_item, write_item
 from georef.stages.base import StageContext

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from georef.errors import StageError
-from georef.estimation.adjustment.checkpoints import digest_of
+from georef.estimation.adjustment.campaign.checkpoints import digest_of
 from georef.estimation.epoch_problem import match_pair, pose_sigma_px
 from georef.estimation.guided import PosedFeatures
 from georef.estimation.tracks import PairMatches

@@ -14,7 +14,7 @@ from scipy.stats import chi2
 
 from georef.estimation.adjustment.adjust_block import AdjustedBlock, BlockOptions, adjust_block
 from georef.estimation.adjustment.block import KINDS_OF_POINT, State
-from georef.estimation.adjustment.coherent import CoherentBlock
+from georef.estimation.adjustment.blunders.coherent import CoherentBlock
 from georef.simulate.drive import Drive, DriveDesign, simulate_drive
 from georef.simulate.drive_blunders import DriveBlunders
 from georef.simulate.drive_priors import DrivePriors

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from georef.cli import app
-from georef.estimation.adjustment.checkpoints import Reached
+from georef.estimation.adjustment.campaign.checkpoints import Reached
 from georef.io.bal import BalProblem, read_bal, write_bal
 from georef.io.poses import read_poses
 from georef.stages.solve_files import SOLVES, SolveFiles

@@ -11,8 +11,8 @@ import pytest
 from scipy.stats import chi2
 
 from georef.errors import GeorefError
-from georef.estimation.adjustment.constraint_terms import POSITION_PRIORS
-from georef.estimation.adjustment.eliminate import IMAGE_OBSERVATIONS
+from georef.estimation.adjustment.equations.constraint_terms import POSITION_PRIORS
+from georef.estimation.adjustment.equations.eliminate import IMAGE_OBSERVATIONS
 from georef.estimation.adjustment.problem import Problem
 from georef.evaluation.statistics import nees
 from georef.geometry.projection import Views

@@ -10,12 +10,12 @@ import pytest
 from georef.errors import GeorefError
 from georef.estimation.adjustment.adjust_block import AdjustedBlock, BlockOptions, adjust_block, quality
 from georef.estimation.adjustment.block import Block, PointPriors, PosePriors, PositionPriors
-from georef.estimation.adjustment.coherent import CoherentBlock, CoherentSearch
-from georef.estimation.adjustment.coherent_members import settled
-from georef.estimation.adjustment.constraint_terms import POSITION_PRIORS
-from georef.estimation.adjustment.eliminate import IMAGE_OBSERVATIONS, normal_equations
-from georef.estimation.adjustment.shift_rows import ShiftRows, shift_system
-from georef.estimation.adjustment.shift_system import ShiftSystem
+from georef.estimation.adjustment.blunders.coherent import CoherentBlock, CoherentSearch
+from georef.estimation.adjustment.blunders.coherent_members import settled
+from georef.estimation.adjustment.blunders.shift_rows import ShiftRows, shift_system
+from georef.estimation.adjustment.blunders.shift_system import ShiftSystem
+from georef.estimation.adjustment.equations.constraint_terms import POSITION_PRIORS
+from georef.estimation.adjustment.equations.eliminate import IMAGE_OBSERVATIONS, normal_equations
 from georef.estimation.adjustment.solver import solve_block
 from tests.worlds.rig_blocks import RigBlock, rig_block
 

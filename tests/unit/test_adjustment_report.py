@@ -15,11 +15,11 @@ from georef.config import DATUM_FINDINGS
 from georef.crs import CrsDefinition, WorldFrame
 from georef.estimation.adjustment.adjust_block import AdjustedBlock, BlockOptions, adjust_block
 from georef.estimation.adjustment.block import Block
-from georef.estimation.adjustment.cofactors import cofactors
-from georef.estimation.adjustment.correlations import shared_unknowns, strong_correlations
-from georef.estimation.adjustment.eliminate import normal_equations
+from georef.estimation.adjustment.equations.cofactors import cofactors
+from georef.estimation.adjustment.equations.eliminate import normal_equations
+from georef.estimation.adjustment.quality.correlations import shared_unknowns, strong_correlations
 from georef.estimation.adjustment.solver import solve_block
-from georef.estimation.datum_types import Kind
+from georef.estimation.datum.types import Kind
 from georef.stages.adjustment_report import adjustment_data, all_reliability
 from georef.stages.adjustment_tables import write_tables
 from tests.unit.test_weak_focal import flight

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from georef.estimation.adjustment.block import Antenna, Block, Calibration, Distances, RigCamera
-from georef.estimation.adjustment.reduced import Layout, Reduced
+from georef.estimation.adjustment.equations.reduced import Layout, Reduced
 from georef.geometry.camera import Camera, project
 from georef.geometry.poses import Poses
 from georef.geometry.rigid import Rigid3

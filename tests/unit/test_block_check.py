@@ -9,11 +9,17 @@ import numpy as np
 import pytest
 
 from georef.config import AdjustConfig
-from georef.estimation.adjustment.block_check import check_block, common_offset, with_points_as_control
-from georef.estimation.adjustment.block_correlations import shared_unknowns, strong_correlations
-from georef.estimation.adjustment.block_solutions import CleanBlock, Solved, clean, solve_with_control, without_offset
-from georef.estimation.adjustment.equations import moved_state
-from georef.estimation.adjustment.reduced import Layout
+from georef.estimation.adjustment.equations.block_equations import moved_state
+from georef.estimation.adjustment.equations.reduced import Layout
+from georef.estimation.adjustment.measured.check import check_block, common_offset, with_points_as_control
+from georef.estimation.adjustment.measured.correlations import shared_unknowns, strong_correlations
+from georef.estimation.adjustment.measured.solutions import (
+    CleanBlock,
+    Solved,
+    clean,
+    solve_with_control,
+    without_offset,
+)
 from georef.geometry.camera import Camera
 from georef.project import open_project
 from georef.stages.block_survey import BlockSurvey, load_block

@@ -9,8 +9,8 @@ import pytest
 
 from georef.config import AdjustConfig
 from georef.errors import ConfigError, InputError
-from georef.estimation.adjustment.block_correlations import shared_unknowns
-from georef.estimation.adjustment.block_solutions import clean, solve_with_control
+from georef.estimation.adjustment.measured.correlations import shared_unknowns
+from georef.estimation.adjustment.measured.solutions import clean, solve_with_control
 from georef.io.bingo import read_bingo, sensor_of_header
 from georef.io.pix4d import read_pix4d_camera, read_pix4d_cameras
 from georef.io.pix4d_ties import read_pix4d_ties, write_pix4d_ties

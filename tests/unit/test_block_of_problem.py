@@ -7,12 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from georef.estimation.adjustment.cofactors import cofactors
-from georef.estimation.adjustment.eliminate import normal_equations
+from georef.estimation.adjustment.equations.cofactors import cofactors
+from georef.estimation.adjustment.equations.eliminate import normal_equations
 from georef.estimation.adjustment.from_problem import Exposure, block_of
-from georef.estimation.adjustment.gtsam_graph import solve_with_gtsam
+from georef.estimation.adjustment.gtsam_reference.graph import solve_with_gtsam
 from georef.estimation.adjustment.problem import Problem
-from georef.estimation.adjustment.reference_part import ReferencePart
+from georef.estimation.adjustment.quality.reference_part import ReferencePart
 from georef.estimation.adjustment.solver import solve_block
 from georef.geometry.rigid import Rigid3
 from georef.types.campaign import Mounting

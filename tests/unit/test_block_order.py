@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from georef.estimation.adjustment.block_order import fronts_of
+from georef.estimation.adjustment.equations.block_order import fronts_of
 
 
 def pattern(stations: int, parts: int, density: float, alone: int, seed: int) -> tuple[np.ndarray, np.ndarray]:

@@ -16,9 +16,9 @@ from georef.estimation.adjustment.block import (
     RelativePoses,
     State,
 )
-from georef.estimation.adjustment.eliminate import normal_equations, total_cost
-from georef.estimation.adjustment.gtsam_graph import BlockGraph, solve_with_gtsam
-from georef.estimation.adjustment.prepared import Prepared
+from georef.estimation.adjustment.equations.eliminate import normal_equations, total_cost
+from georef.estimation.adjustment.equations.prepared import Prepared
+from georef.estimation.adjustment.gtsam_reference.graph import BlockGraph, solve_with_gtsam
 from georef.estimation.adjustment.solver import Iteration, SolverOptions, solve_block
 from georef.geometry.camera import Camera
 from georef.geometry.rigid import Array

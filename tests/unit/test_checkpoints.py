@@ -17,7 +17,7 @@ import pytest
 
 from georef.estimation.adjustment.adjust_block import BlockOptions, adjust_block
 from georef.estimation.adjustment.block import Block, State
-from georef.estimation.adjustment.checkpoints import Reached, Resumable, digest_of
+from georef.estimation.adjustment.campaign.checkpoints import Reached, Resumable, digest_of
 from georef.estimation.adjustment.solver import BlockSolution, SolverOptions, solve_block
 from georef.geometry.poses import Poses
 from georef.io.bal import BalProblem, write_bal
@@ -30,7 +30,7 @@ _KILLED = """
 import os, signal, sys
 from pathlib import Path
 from georef.estimation.adjustment.adjust_block import BlockOptions, adjust_block
-from georef.estimation.adjustment.checkpoints import Resumable
+from georef.estimation.adjustment.campaign.checkpoints import Resumable
 from georef.io.bal import BalProblem, write_bal
 from georef.stages.bal import run_bal
 from georef.stages.solve_files import SolveFiles

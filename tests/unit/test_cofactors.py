@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from georef.estimation.adjustment.block_cholesky import BlockCholesky, Pattern, SingularMatrix
-from georef.estimation.adjustment.cofactors import Cofactors, cofactors
-from georef.estimation.adjustment.reduced import Layout, Reduced
+from georef.estimation.adjustment.equations.block_cholesky import BlockCholesky, Pattern, SingularMatrix
+from georef.estimation.adjustment.equations.cofactors import Cofactors, cofactors
+from georef.estimation.adjustment.equations.reduced import Layout, Reduced
 from georef.geometry.rigid import Array
 from tests.worlds.dense_normals import Equations, equations, reduced_of, sparse
 from tests.worlds.rig_blocks import rig_block

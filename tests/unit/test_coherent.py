@@ -10,8 +10,8 @@ import pytest
 from scipy.stats import chi2
 
 from georef.estimation.adjustment.block import Block, Calibration, PosePriors, RigCamera
-from georef.estimation.adjustment.coherent import CoherentSearch, coherent_blocks
-from georef.estimation.adjustment.shift_system import Members, ShiftSystem
+from georef.estimation.adjustment.blunders.coherent import CoherentSearch, coherent_blocks
+from georef.estimation.adjustment.blunders.shift_system import Members, ShiftSystem
 from georef.geometry.camera import Camera
 from georef.geometry.poses import Poses
 from georef.geometry.rigid import Array, Rigid3

@@ -9,10 +9,10 @@ import pytest
 
 from georef.estimation.adjustment import block as adjustment
 from georef.estimation.adjustment.block import KINDS_OF_POINT, KINDS_OF_POSE
-from georef.estimation.adjustment.components import Component
-from georef.estimation.adjustment.constraint_terms import POSITION_PRIORS
-from georef.estimation.adjustment.eliminate import IMAGE_OBSERVATIONS
+from georef.estimation.adjustment.equations.constraint_terms import POSITION_PRIORS
+from georef.estimation.adjustment.equations.eliminate import IMAGE_OBSERVATIONS
 from georef.estimation.adjustment.network import orientation_components
+from georef.estimation.adjustment.quality.components import Component
 from georef.geometry.projection import linearize
 from georef.geometry.rigid import Array
 from tests.worlds.adjusted import Solved, adjusted, images_alone

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from georef.estimation.adjustment.block import Antenna, Block, Calibration, Distances, State
-from georef.estimation.adjustment.constraint_terms import Term, constraint_terms, root
-from georef.estimation.adjustment.reduced import Layout
+from georef.estimation.adjustment.equations.constraint_terms import Term, constraint_terms, root
+from georef.estimation.adjustment.equations.reduced import Layout
 from georef.geometry.pose_jacobians import inverse_right_jacobians
 from georef.geometry.poses import Poses
 from georef.geometry.rigid import Array

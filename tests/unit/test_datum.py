@@ -19,10 +19,10 @@ from georef.estimation.adjustment.block import (
     RelativePoses,
     RigCamera,
 )
-from georef.estimation.adjustment.datum import explain_singular
-from georef.estimation.adjustment.datum_words import name_of_unknown
-from georef.estimation.adjustment.gtsam_graph import BlockGraph
-from georef.estimation.adjustment.reduced import Layout, Reduced
+from georef.estimation.adjustment.equations.reduced import Layout, Reduced
+from georef.estimation.adjustment.gtsam_reference.graph import BlockGraph
+from georef.estimation.datum.singular import explain_singular
+from georef.estimation.datum.singular_words import name_of_unknown
 from georef.geometry.camera import Camera
 from georef.geometry.poses import Poses
 from georef.geometry.rigid import Array, Rigid3
@@ -292,7 +292,7 @@ def test_parts_that_a_measured_motion_ties_are_one() -> None:
 
 @pytest.mark.parametrize("dense", [1500, 0], ids=["dense", "sparse"])
 def test_the_weakest_combination_is_found_in_large_networks_too(dense: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("georef.estimation.adjustment.datum._DENSE", dense)
+    monkeypatch.setattr("georef.estimation.datum.singular._DENSE", dense)
     said = explained(_CASES["two points of one station"].make())
     assert said is not None
     assert "'S5'" in said

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from pyproj import Transformer
 
-from georef.estimation.datum_sentinel import DatumReport, Paired, compare_datums
+from georef.estimation.datum.sentinel import DatumReport, Paired, compare_datums
 from georef.simulate.drive_city import draw_route
 
 _ORIGIN = (400_000.0, 5_540_000.0)

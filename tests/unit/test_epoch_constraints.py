@@ -8,8 +8,6 @@ import numpy as np
 import pytest
 
 from georef.estimation.adjustment.block import Antenna, Block, Distances, PositionPriors, RelativePoses, State
-from georef.estimation.adjustment.cofactors import Cofactors, cofactors
-from georef.estimation.adjustment.eliminate import normal_equations
 from georef.estimation.adjustment.epoch_constraints import (
     GnssOffset,
     with_antenna,
@@ -20,6 +18,8 @@ from georef.estimation.adjustment.epoch_constraints import (
     with_marked_points,
     with_motions,
 )
+from georef.estimation.adjustment.equations.cofactors import Cofactors, cofactors
+from georef.estimation.adjustment.equations.eliminate import normal_equations
 from georef.estimation.adjustment.solver import solve_block
 from georef.geometry.camera import Camera
 from georef.geometry.rigid import Array

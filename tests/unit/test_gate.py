@@ -10,11 +10,11 @@ from scipy.stats import binom
 
 from georef.estimation.adjustment import block as adjustment
 from georef.estimation.adjustment.adjust_block import quality
-from georef.estimation.adjustment.block_gates import GATED, name_of
-from georef.estimation.adjustment.constraint_terms import POSITION_PRIORS
-from georef.estimation.adjustment.eliminate import IMAGE_OBSERVATIONS
-from georef.estimation.adjustment.group_tests import TermTests, constraint_tests
+from georef.estimation.adjustment.blunders.gates import GATED, name_of
+from georef.estimation.adjustment.equations.constraint_terms import POSITION_PRIORS
+from georef.estimation.adjustment.equations.eliminate import IMAGE_OBSERVATIONS
 from georef.estimation.adjustment.network import worst_orientation
+from georef.estimation.adjustment.quality.group_tests import TermTests, constraint_tests
 from georef.estimation.adjustment.solver import solve_block
 from georef.geometry.poses import Poses
 from georef.geometry.rigid import Rigid3

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from georef.estimation.adjustment.block import Block, State
-from georef.estimation.adjustment.cofactors import cofactors
-from georef.estimation.adjustment.constraint_terms import POSE_PRIORS, POSITION_PRIORS, constraint_terms
-from georef.estimation.adjustment.eliminate import IMAGE_OBSERVATIONS, normal_equations
-from georef.estimation.adjustment.group_tests import components, constraint_tests, image_tests, joint_test
+from georef.estimation.adjustment.equations.cofactors import cofactors
+from georef.estimation.adjustment.equations.constraint_terms import POSE_PRIORS, POSITION_PRIORS, constraint_terms
+from georef.estimation.adjustment.equations.eliminate import IMAGE_OBSERVATIONS, normal_equations
+from georef.estimation.adjustment.quality.group_tests import components, constraint_tests, image_tests, joint_test
 from georef.estimation.adjustment.solver import solve_block
 from tests.worlds.dense_normals import Equations, equations
 from tests.worlds.rig_blocks import rig_block

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from georef.estimation.adjustment.block import Block, Calibration, Distances, PointPriors, State
-from georef.estimation.adjustment.constraint_terms import Term, constraint_terms
-from georef.estimation.adjustment.gtsam_factors import Lens, custom_observation, native_calibration
-from georef.estimation.adjustment.gtsam_graph import BlockGraph, solve_with_gtsam
-from georef.estimation.adjustment.reduced import Layout
+from georef.estimation.adjustment.equations.constraint_terms import Term, constraint_terms
+from georef.estimation.adjustment.equations.reduced import Layout
+from georef.estimation.adjustment.gtsam_reference.factors import Lens, custom_observation, native_calibration
+from georef.estimation.adjustment.gtsam_reference.graph import BlockGraph, solve_with_gtsam
 from georef.geometry.camera import Camera, intrinsic_derivatives
 from georef.geometry.projection import linearize
 from georef.geometry.rigid import Array

@@ -9,8 +9,8 @@ import pytest
 
 from georef.estimation.adjustment.adjust_block import BlockOptions, adjust_block
 from georef.estimation.adjustment.block import KINDS_OF_POINT, Block, ReferenceRays
-from georef.estimation.adjustment.eliminate import normal_equations
-from georef.estimation.adjustment.image_covariances import image_covariances
+from georef.estimation.adjustment.equations.eliminate import normal_equations
+from georef.estimation.adjustment.quality.image_covariances import image_covariances
 from georef.estimation.reference_errors import ReferenceErrors
 from tests.worlds.rig_blocks import rig_block
 

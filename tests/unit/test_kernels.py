@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from georef.estimation.adjustment.kernels import by_unknown, lens
-from georef.estimation.adjustment.kernels_points import loss, root_weight
-from georef.estimation.adjustment.prepared import code_of, counting_order
+from georef.estimation.adjustment.equations.prepared import code_of, counting_order
+from georef.estimation.adjustment.kernels.observations import by_unknown, lens
+from georef.estimation.adjustment.kernels.points import loss, root_weight
 from georef.geometry.camera import Camera, intrinsic_derivatives, project
 from georef.geometry.projection import MODEL_NAMES
 from georef.geometry.rigid import Array

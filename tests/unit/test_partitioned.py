@@ -10,8 +10,8 @@ import pytest
 from georef.errors import GeorefError
 from georef.estimation.adjustment.adjust_block import BlockOptions, adjust_block
 from georef.estimation.adjustment.block import Block, PosePriors, PositionPriors
-from georef.estimation.adjustment.partition import part_of, partition
-from georef.estimation.adjustment.partitioned import Partitioned
+from georef.estimation.adjustment.campaign.partition import part_of, partition
+from georef.estimation.adjustment.campaign.partitioned import Partitioned
 from georef.estimation.adjustment.solver import BlockSolution, SolverOptions, solve_block
 from georef.executor import Executor
 from georef.simulate.drive import DriveDesign, simulate_drive

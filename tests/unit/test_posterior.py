@@ -11,7 +11,7 @@ import pytest
 from georef.errors import GeorefError
 from georef.estimation.adjustment import block as adjustment
 from georef.estimation.adjustment.adjust_block import quality
-from georef.estimation.adjustment.gtsam_graph import BlockGraph
+from georef.estimation.adjustment.gtsam_reference.graph import BlockGraph
 from georef.estimation.adjustment.problem import Problem
 from georef.estimation.adjustment.solver import SolverOptions, solve_block
 from georef.geometry.rigid import Array

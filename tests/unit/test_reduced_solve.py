@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from georef.estimation.adjustment.block_cholesky import Pattern, SingularMatrix
-from georef.estimation.adjustment.equations import BlockEquations, moved_state
-from georef.estimation.adjustment.reduced import Reduced
-from georef.estimation.adjustment.reduced_solve import ReducedFactor, StepSolver, conjugate_gradients, product
+from georef.estimation.adjustment.equations.block_cholesky import Pattern, SingularMatrix
+from georef.estimation.adjustment.equations.block_equations import BlockEquations, moved_state
+from georef.estimation.adjustment.equations.reduced import Reduced
+from georef.estimation.adjustment.equations.reduced_solve import ReducedFactor, StepSolver, conjugate_gradients, product
 from georef.estimation.adjustment.solver import SolverOptions, promised_decrease, solve_block
 from georef.geometry.rigid import Array
 from tests.worlds.rig_blocks import rig_block

@@ -9,11 +9,11 @@ import pytest
 from scipy.stats import norm
 
 from georef.estimation.adjustment.block import Block, State
-from georef.estimation.adjustment.cofactors import cofactors
-from georef.estimation.adjustment.constraint_terms import POSITION_PRIORS, RELATIVE_POSES
-from georef.estimation.adjustment.eliminate import normal_equations
-from georef.estimation.adjustment.group_tests import TermTests, constraint_tests, image_tests
-from georef.estimation.adjustment.reliability import DELTA0, Reliability, reliability
+from georef.estimation.adjustment.equations.cofactors import cofactors
+from georef.estimation.adjustment.equations.constraint_terms import POSITION_PRIORS, RELATIVE_POSES
+from georef.estimation.adjustment.equations.eliminate import normal_equations
+from georef.estimation.adjustment.quality.group_tests import TermTests, constraint_tests, image_tests
+from georef.estimation.adjustment.quality.reliability import DELTA0, Reliability, reliability
 from georef.estimation.adjustment.solver import solve_block
 from georef.geometry.rigid import Array
 from tests.worlds.dense_normals import equations

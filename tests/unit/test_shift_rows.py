@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from georef.estimation.adjustment.block import Block, Indices, PointPriors, State
-from georef.estimation.adjustment.cofactors import cofactors
-from georef.estimation.adjustment.eliminate import IMAGE_OBSERVATIONS, normal_equations
-from georef.estimation.adjustment.given_points import GivenRays
-from georef.estimation.adjustment.reduced import Layout
-from georef.estimation.adjustment.shift_rows import ShiftRows, shift_rows, shift_system, stations_of_points
-from georef.estimation.adjustment.shift_system import ShiftSystem
+from georef.estimation.adjustment.blunders.shift_rows import ShiftRows, shift_rows, shift_system, stations_of_points
+from georef.estimation.adjustment.blunders.shift_system import ShiftSystem
+from georef.estimation.adjustment.equations.cofactors import cofactors
+from georef.estimation.adjustment.equations.eliminate import IMAGE_OBSERVATIONS, normal_equations
+from georef.estimation.adjustment.equations.given_points import GivenRays
+from georef.estimation.adjustment.equations.reduced import Layout
 from georef.geometry.rigid import Array
 from tests.worlds.dense_normals import Equations, equations
 from tests.worlds.rig_blocks import rig_block

@@ -10,9 +10,9 @@ import pytest
 
 from georef.estimation.adjustment.adjust_block import AdjustedBlock, BlockOptions, adjust_block
 from georef.estimation.adjustment.block import KINDS_OF_POINT, Block
+from georef.estimation.adjustment.campaign.standing import Standing, constraint_keys
+from georef.estimation.adjustment.campaign.updating import updated
 from georef.estimation.adjustment.solver import solve_block
-from georef.estimation.adjustment.standing import Standing, constraint_keys
-from georef.estimation.adjustment.updating import updated
 from georef.simulate.drive import DriveDesign, simulate_drive
 from georef.simulate.drive_blunders import DriveBlunders
 

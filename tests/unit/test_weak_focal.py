@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from georef.estimation.adjustment.block import Block, Calibration, PointPriors, RigCamera
-from georef.estimation.adjustment.datum import explain_singular
-from georef.estimation.adjustment.gtsam_graph import BlockGraph
-from georef.estimation.adjustment.reduced import Layout
-from georef.estimation.adjustment.weak_focal import WeakFocal, weak_focals
+from georef.estimation.adjustment.equations.reduced import Layout
+from georef.estimation.adjustment.gtsam_reference.graph import BlockGraph
+from georef.estimation.adjustment.quality.weak_focal import WeakFocal, weak_focals
+from georef.estimation.datum.singular import explain_singular
 from georef.geometry.camera import Camera
 from georef.geometry.poses import Poses
 from georef.geometry.rigid import Rigid3

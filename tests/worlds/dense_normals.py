@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from georef.estimation.adjustment.block import Block, State
-from georef.estimation.adjustment.constraint_terms import constraint_terms, root
-from georef.estimation.adjustment.reduced import Layout, Reduced
+from georef.estimation.adjustment.equations.constraint_terms import constraint_terms, root
+from georef.estimation.adjustment.equations.reduced import Layout, Reduced
 from georef.geometry.camera import intrinsic_derivatives
 from georef.geometry.projection import linearize
 from georef.geometry.rigid import Array

@@ -24,8 +24,8 @@ from georef.estimation.adjustment.block import (
     RigCamera,
     State,
 )
-from georef.estimation.adjustment.equations import moved_state
-from georef.estimation.adjustment.reduced import Layout
+from georef.estimation.adjustment.equations.block_equations import moved_state
+from georef.estimation.adjustment.equations.reduced import Layout
 from georef.geometry.camera import Camera
 from georef.geometry.poses import Poses
 from georef.geometry.projection import Views

@@ -12,20 +12,25 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from georef.estimation.adjustment.block import KINDS_OF_POINT, Block, State
-from georef.estimation.adjustment.block_gates import Contradictions, RejectedConstraint
-from georef.estimation.adjustment.block_quality import Quality, quality
-from georef.estimation.adjustment.coherent import CoherentBlock, CoherentSearch
-from georef.estimation.adjustment.coherent_members import settled
-from georef.estimation.adjustment.coherent_search import (
+from georef.estimation.adjustment.blunders.coherent import CoherentBlock, CoherentSearch
+from georef.estimation.adjustment.blunders.coherent_members import settled
+from georef.estimation.adjustment.blunders.coherent_search import (
     named_rows,
     search_coherent,
     shared_by_references,
     without_named,
 )
-from georef.estimation.adjustment.constraint_terms import DISTANCES, POSE_PRIORS, POSITION_PRIORS, RELATIVE_POSES
-from georef.estimation.adjustment.eliminate import IMAGE_OBSERVATIONS
-from georef.estimation.adjustment.prepared import Prepared
-from georef.estimation.adjustment.readmission import agreeing
+from georef.estimation.adjustment.blunders.gates import Contradictions, RejectedConstraint
+from georef.estimation.adjustment.blunders.readmission import agreeing
+from georef.estimation.adjustment.equations.constraint_terms import (
+    DISTANCES,
+    POSE_PRIORS,
+    POSITION_PRIORS,
+    RELATIVE_POSES,
+)
+from georef.estimation.adjustment.equations.eliminate import IMAGE_OBSERVATIONS
+from georef.estimation.adjustment.equations.prepared import Prepared
+from georef.estimation.adjustment.quality.block_quality import Quality, quality
 from georef.estimation.adjustment.solver import BlockSolution, Solve, SolverOptions, solve_block
 
 _GATE_ROUNDS, _ROBUST_ROUNDS = 4, 2

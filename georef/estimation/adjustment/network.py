@@ -14,9 +14,9 @@ import numpy as np
 from georef.config import AdjustConfig
 from georef.estimation.adjustment.adjust_block import Quality, quality
 from georef.estimation.adjustment.block import KINDS_OF_POSE, Block, Calibration, PosePriors, RigCamera, State
-from georef.estimation.adjustment.components import Component
-from georef.estimation.adjustment.eliminate import IMAGE_OBSERVATIONS
-from georef.estimation.adjustment.group_tests import TermTests
+from georef.estimation.adjustment.equations.eliminate import IMAGE_OBSERVATIONS
+from georef.estimation.adjustment.quality.components import Component
+from georef.estimation.adjustment.quality.group_tests import TermTests
 from georef.estimation.adjustment.solver import SolverOptions, solve_block
 from georef.geometry.camera import Camera
 from georef.geometry.poses import Poses

@@ -15,12 +15,12 @@ import numpy as np
 
 from georef.errors import GeorefError
 from georef.estimation.adjustment.block import Block, State
-from georef.estimation.adjustment.block_cholesky import SingularMatrix
-from georef.estimation.adjustment.eliminate import Linearized, Losses, normal_equations
-from georef.estimation.adjustment.equations import BlockEquations, Equations, Moved
-from georef.estimation.adjustment.prepared import Prepared
-from georef.estimation.adjustment.reduced import Layout
-from georef.estimation.adjustment.reduced_solve import StepSolver
+from georef.estimation.adjustment.equations.block_cholesky import SingularMatrix
+from georef.estimation.adjustment.equations.block_equations import BlockEquations, Equations, Moved
+from georef.estimation.adjustment.equations.eliminate import Linearized, Losses, normal_equations
+from georef.estimation.adjustment.equations.prepared import Prepared
+from georef.estimation.adjustment.equations.reduced import Layout
+from georef.estimation.adjustment.equations.reduced_solve import StepSolver
 from georef.geometry.rigid import Array
 
 _log = logging.getLogger(__name__)
@@ -234,8 +234,8 @@ class Minimizer:
 
     def _singular(self, error: SingularMatrix, state: State) -> GeorefError:
         """What is missing, in the words of `datum` where it finds a reason."""
-        from georef.estimation.adjustment.datum import explain_singular
-        from georef.estimation.adjustment.datum_words import name_of_unknown
+        from georef.estimation.datum.singular import explain_singular
+        from georef.estimation.datum.singular_words import name_of_unknown
 
         unknown = name_of_unknown(self._block, self._attempts.layout, error.unknown)
         return GeorefError(
