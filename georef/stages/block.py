@@ -14,12 +14,7 @@ from georef import __version__
 from georef.config import AdjustConfig
 from georef.estimation.adjustment.campaign.checkpoints import Resumable
 from georef.estimation.adjustment.measured.check import common_offset
-from georef.estimation.adjustment.measured.correlations import (
-    Correlation,
-    ground_height_correlations,
-    shared_unknowns,
-    strong_correlations,
-)
+from georef.estimation.adjustment.measured.correlations import correlations_of, ground_height_correlations, unknowns_of
 from georef.estimation.adjustment.measured.solution_quality import CONTROL
 from georef.estimation.adjustment.measured.solutions import (
     CleanBlock,
@@ -177,7 +172,7 @@ def _offset(
     offset = common_offset(found.check)
     if offset is None:
         return {}
-    height: list[Correlation] = ground_height_correlations(found.block, found.check, found.cofactors.border)
+    height = ground_height_correlations(found.block, found.check, found.cofactors.border)
     return {
         "offset_m": offset.offset_m.tolist(),
         "sigma_m": offset.sigma_m.tolist(),
@@ -186,9 +181,9 @@ def _offset(
         "mean_difference_m": np.mean([e.difference_m for e in found.check.errors.determined], axis=0).tolist(),
         "points": len(found.check.errors.determined),
         "left_out": wrong,
-        "shared_unknowns": [asdict(unknown) for unknown in shared_unknowns(found)],
+        "shared_unknowns": [asdict(unknown) for unknown in unknowns_of(found)],
         "height_correlations": [asdict(c) for c in height],
-        "correlations": [asdict(c) for c in strong_correlations(found)],
+        "correlations": [asdict(c) for c in correlations_of(found)],
         "check_points": [error.to_dict() for error in found.check.errors.determined],
     }
 

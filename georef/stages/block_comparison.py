@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from georef.errors import InputError
-from georef.estimation.adjustment.measured.correlations import shared_unknowns
+from georef.estimation.adjustment.measured.correlations import unknowns_of
 from georef.estimation.adjustment.measured.solutions import Solved
 from georef.evaluation.calibrations import compare_calibrations, difference_map
 from georef.geometry.camera import Camera
@@ -23,7 +23,7 @@ def comparisons(project: Project, section: BlockComparison, found: Solved) -> li
     """Each camera that the other program knows. Raises InputError."""
     ours = {camera.camera_id: camera for camera in found.solution.state.cameras}
     theirs = _theirs(project, section, found, ours)
-    sigmas = {unknown.name: unknown.sigma for unknown in shared_unknowns(found)}
+    sigmas = {unknown.name: unknown.sigma for unknown in unknowns_of(found)}
     return [_comparison(ours[name], camera, section.format, sigmas) for name, camera in theirs.items()]
 
 
@@ -74,7 +74,7 @@ def _comparison(ours: Camera, theirs: Camera, program: str, sigmas: dict[str, fl
             {
                 "name": name,
                 "value": ours.value(name),
-                "sigma": sigmas.get(f"{ours.camera_id} {name}"),
+                "sigma": sigmas.get(f"{name} of {ours.camera_id}"),
                 "other": theirs.value(name),
             }
             for name in names

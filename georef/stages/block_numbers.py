@@ -12,7 +12,7 @@ import numpy as np
 from georef.estimation.adjustment.blunders.gates import RejectedConstraint
 from georef.estimation.adjustment.equations.constraint_terms import DISTANCES
 from georef.estimation.adjustment.measured.check import check_block
-from georef.estimation.adjustment.measured.correlations import shared_unknowns, strong_correlations
+from georef.estimation.adjustment.measured.correlations import correlations_of, unknowns_of
 from georef.estimation.adjustment.measured.solution_quality import (
     control_quality,
     position_quality,
@@ -53,8 +53,8 @@ def variant_numbers(found: Solved, tie_ids: Sequence[str] = ()) -> dict[str, Any
         "check": {str(kind): summary.to_dict() for kind, summary in summaries.items()},
         "check_points": [error.to_dict() for error in found.check.errors.determined],
         "not_determined": [entry.to_dict() for entry in found.check.errors.not_determined],
-        "shared_unknowns": [asdict(unknown) for unknown in shared_unknowns(found)],
-        "correlations": [asdict(c) for c in strong_correlations(found)],
+        "shared_unknowns": [asdict(unknown) for unknown in unknowns_of(found)],
+        "correlations": [asdict(c) for c in correlations_of(found)],
     }
 
 

@@ -123,8 +123,8 @@ def _mounting_errors(made: Oblique, report: dict[str, Any]) -> np.ndarray:
     unknowns = {u["name"]: u for u in report["variants"]["as declared"]["shared_unknowns"]}
     out = []
     for name in NAMES[1:]:
-        turn = [unknowns[f"mounting {name} turn {axis}"] for axis in "xyz"]
-        shift = [unknowns[f"mounting {name} shift {axis}"] for axis in "xyz"]
+        turn = [unknowns[f"boresight of {name} about camera {axis}"] for axis in "xyz"]
+        shift = [unknowns[f"mounting of {name} along camera {axis}"] for axis in "xyz"]
         truth = nominal(name).local(made.rig_from_cam[name])
         truth[:3] = np.degrees(truth[:3])
         out.append([(u["value"] - t) / u["sigma"] for u, t in zip([*turn, *shift], truth, strict=True)])

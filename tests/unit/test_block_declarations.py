@@ -9,7 +9,7 @@ import pytest
 
 from georef.config import AdjustConfig
 from georef.errors import ConfigError, InputError
-from georef.estimation.adjustment.measured.correlations import shared_unknowns
+from georef.estimation.adjustment.measured.correlations import unknowns_of
 from georef.estimation.adjustment.measured.solutions import clean, solve_with_control
 from georef.io.bingo import read_bingo, sensor_of_header
 from georef.io.pix4d import read_pix4d_camera, read_pix4d_cameras
@@ -144,7 +144,7 @@ def test_drift_in_time_is_found(tmp_path: Path) -> None:
 def _drift_of(survey: BlockSurvey) -> dict:
     cleaned = clean(survey.block, _CONFIG)
     assert len(cleaned.rejected) <= 1
-    return {u.name: u for u in shared_unknowns(solve_with_control(cleaned, survey.surveyed, (), _CONFIG))}
+    return {u.name: u for u in unknowns_of(solve_with_control(cleaned, survey.surveyed, (), _CONFIG))}
 
 
 def _with_drift(folder: Path, offsets: np.ndarray, gnss: str) -> Path:

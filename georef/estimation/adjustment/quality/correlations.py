@@ -14,6 +14,7 @@ import numpy as np
 
 from georef.estimation.adjustment.block import Block, State
 from georef.estimation.adjustment.equations.cofactors import Cofactors
+from georef.estimation.adjustment.equations.reduced import Layout
 from georef.geometry.rigid import Array
 
 STRONG = 0.9
@@ -72,10 +73,10 @@ def strong_correlations(block: Block, state: State, found: Cofactors, least: flo
         for j in range(i + 1, len(entries))
         if abs(among[i, j]) >= least
     ]
-    means = _means(block, state)
+    means = _means(block, state, found.layout)
     vectors = np.column_stack(list(means.values()))
-    solved = found.apply(np.concatenate([vectors, np.zeros((found.layout.border, vectors.shape[1]))]))
-    variance = np.einsum("um,um->m", vectors, solved[: len(vectors)])
+    solved = found.apply(vectors)
+    variance = np.einsum("um,um->m", vectors, solved)
     with_means = solved[6 * found.layout.stations :][rows] / sigma[:, None] / np.sqrt(variance)
     pairs += [
         Correlation(entry.name, name, float(with_means[i, k]))
@@ -86,18 +87,17 @@ def strong_correlations(block: Block, state: State, found: Cofactors, least: flo
     return sorted(pairs, key=lambda pair: -abs(pair.value))
 
 
-def _means(block: Block, state: State) -> dict[str, Array]:
-    """Means of the steps of all stations, (6 S,) each: position along world and rig axes, attitude about the axes of
-    cameras whose mountings are estimated, distance along the optical axes of cameras that are."""
+def _means(block: Block, state: State, layout: Layout) -> dict[str, Array]:
+    """Means of the steps of all stations, (6 S + B,) each: position along world and rig axes, attitude about the axes
+    of cameras whose mountings are estimated; of the images of estimated cameras, distance along the optical axis and
+    attitude."""
     count = len(block.station_ids)
     rotation = state.world_from_rig.rotation
-    blank = np.zeros((count, 6))
     out: dict[str, Array] = {}
 
     def mean(name: str, columns: slice, weights: Array) -> None:
-        rows = blank.copy()
-        rows[:, columns] = weights / count
-        out[name] = rows.ravel()
+        out[name] = np.zeros(layout.size)
+        out[name][: 6 * count].reshape(count, 6)[:, columns] = weights / count
 
     for axis, label in enumerate(_WORLD):
         mean(f"mean position of the stations {label}", slice(3, 6), rotation[:, axis])
@@ -108,20 +108,36 @@ def _means(block: Block, state: State) -> dict[str, Array]:
     for axis, label in enumerate(_RIG):
         mean(f"mean position of the stations along rig {label}", slice(3, 6), np.eye(3)[axis])
     for index, calibration in enumerate(block.calibrations):
-        if "focal" in calibration.camera.estimate:
-            out[f"distance of {calibration.camera.camera_id} to its scene"] = _backwards(block, state, index)
+        camera = calibration.camera
+        if "focal" in camera.estimate:
+            out[f"distance of {camera.camera_id} to its scene"] = _backwards(block, state, layout, index)
+        for name, axis, turn in (("cx", 1, "roll"), ("cy", 0, "pitch")):
+            if name in camera.estimate:
+                out[f"mean {turn} of the images of {camera.camera_id}"] = _turned(block, state, layout, index, axis)
     return out
 
 
-def _backwards(block: Block, state: State, calibration: int) -> Array:
-    """The mean step of the images of a camera against their optical axes, by their stations (6 S,)."""
+def _turned(block: Block, state: State, layout: Layout, calibration: int, axis: int) -> Array:
+    """The mean turn (6 S + B,) of the images of a camera about an axis of it, that of their mountings included."""
     images = np.flatnonzero(block.calibration == calibration)
-    rows = np.zeros((len(block.station_ids), 6))
+    mounting, out, edge = block.mounting[images], np.zeros(layout.size), 6 * layout.stations
+    rows = out[:edge].reshape(-1, 6)
+    np.add.at(rows[:, :3], block.station[images], state.rig_from_cam.rotation[mounting][:, :, axis] / len(images))
+    at = layout.mounting[mounting]
+    np.add.at(out, edge + at[at >= 0] + axis, 1.0 / len(images))
+    return out
+
+
+def _backwards(block: Block, state: State, layout: Layout, calibration: int) -> Array:
+    """The mean step of the images of a camera against their optical axes, by their stations (6 S + B,)."""
+    images = np.flatnonzero(block.calibration == calibration)
+    out = np.zeros(layout.size)
+    rows = out[: 6 * layout.stations].reshape(-1, 6)
     mountings = state.rig_from_cam.take(block.mounting[images])
     axis = mountings.rotation[:, :, 2]  # in the rig
     np.add.at(rows[:, 3:], block.station[images], -axis / len(images))
     np.add.at(rows[:, :3], block.station[images], -np.cross(mountings.translation, axis) / len(images))
-    return rows.ravel()
+    return out
 
 
 def _entries(block: Block, state: State, found: Cofactors) -> Iterator[_Entry]:
