@@ -12,12 +12,16 @@ from numpy.typing import NDArray
 
 from georef.crs import WorldFrame
 from georef.estimation.adjustment.adjust_block import AdjustedBlock
-from georef.estimation.adjustment.block import KINDS_OF_POINT, KINDS_OF_POSE, Block, State
+from georef.estimation.adjustment.block import KINDS_OF_POINT, KINDS_OF_POSE, Block
 from georef.estimation.adjustment.blunders.coherent import CoherentBlock
 from georef.estimation.adjustment.blunders.gates import RejectedConstraint
-from georef.estimation.adjustment.equations.constraint_terms import DISTANCES, POSITION_PRIORS, RELATIVE_POSES
+from georef.estimation.adjustment.equations.constraint_terms import (
+    DISTANCES,
+    POSITION_PRIORS,
+    RELATIVE_POSES,
+    position_residuals,
+)
 from georef.estimation.adjustment.equations.eliminate import IMAGE_OBSERVATIONS
-from georef.estimation.adjustment.quality.components import Component
 from georef.estimation.adjustment.quality.correlations import shared_unknowns, strong_correlations
 from georef.estimation.adjustment.quality.reliability import NO_WEIGHT, Reliability, reliability
 from georef.estimation.adjustment.quality.weak_focal import weak_focals
@@ -56,7 +60,7 @@ def adjustment_data(given: Block, adjusted: AdjustedBlock, checked: Mapping[str,
         "coherent_blocks": [_coherent(wrong) for wrong in adjusted.wrong],
         "undecidable": adjusted.undecidable,
         "variance_components": {
-            GROUPS[name]: component_data(c) for name, c in adjusted.quality.components.items() if name in GROUPS
+            GROUPS[name]: c.to_dict() for name, c in adjusted.quality.components.items() if name in GROUPS
         },
         "redundancy": _redundancy(adjusted),
         "reliability": {GROUPS[name]: reliability_summary(found) for name, found in checked.items() if len(found)},
@@ -183,15 +187,6 @@ def _coherent(wrong: CoherentBlock) -> dict[str, Any]:
     }
 
 
-def component_data(component: Component) -> dict[str, Any]:
-    return {
-        "observations": component.observations,
-        "redundancy": component.redundancy,
-        "factor": component.factor,
-        "factor_sigma": component.factor_sigma,
-    }
-
-
 def _per_image(adjusted: AdjustedBlock) -> dict[str, Any]:
     """Number of observations, residual RMS in pixels and offset from GNSS of each image."""
     block, state = adjusted.block, adjusted.solution.state
@@ -203,7 +198,7 @@ def _per_image(adjusted: AdjustedBlock) -> dict[str, Any]:
         name: {"observations": int(n), "residual_rms_px": float(np.sqrt(t / n)) if n else None}
         for name, n, t in zip(block.image_ids, count, total, strict=True)
     }
-    priors, residuals = block.position_priors, _gnss_residuals(block, state)
+    priors, residuals = block.position_priors, position_residuals(block, state)
     places = zip(block.station.tolist(), block.mounting.tolist(), strict=True)
     image_at = dict(zip(places, block.image_ids, strict=True))
     for image, station in zip(reversed(block.image_ids), reversed(block.station.tolist()), strict=True):
@@ -212,17 +207,6 @@ def _per_image(adjusted: AdjustedBlock) -> dict[str, Any]:
         image = image_at.get((station, antenna), image_at[station, _FIRST])  # of an antenna: the station's first
         out[image]["gnss_residual_m"] = offset.tolist()
     return out
-
-
-def _gnss_residuals(block: Block, state: State) -> Array:
-    """Adjusted less measured positions (K, 3) of antennas, the estimated offset taken off."""
-    priors = block.position_priors
-    antenna = state.world_from_rig.take(priors.station).apply(state.lever_arms_m[priors.antenna])
-    drift = np.zeros((len(priors), 3))
-    for column in range(2):
-        there = priors.drift_node[:, column] >= 0
-        drift[there] += priors.drift_weight[there, column, None] * state.drift_m[priors.drift_node[there, column]]
-    return antenna + drift - priors.position
 
 
 def _control(given: Block, adjusted: AdjustedBlock, checked: Mapping[str, Reliability]) -> list[dict[str, Any]]:

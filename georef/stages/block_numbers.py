@@ -19,7 +19,6 @@ from georef.estimation.adjustment.measured.solution_quality import (
     variance_components,
 )
 from georef.estimation.adjustment.measured.solutions import Solved
-from georef.estimation.adjustment.quality.components import Component
 from georef.estimation.adjustment.quality.reliability import DELTA0
 from georef.evaluation.statistics import finite, finite_list
 from georef.geometry.rigid import Array
@@ -41,7 +40,7 @@ def variant_numbers(found: Solved, tie_ids: Sequence[str] = ()) -> dict[str, Any
         "converged": found.solution.converged,
         "sigma0": found.sigma0,
         "redundancy": found.redundancy,
-        "components": {name: component_numbers(part) for name, part in variance_components(found).items()},
+        "components": {name: part.to_dict() for name, part in variance_components(found).items()},
         "control_points": control,
         "control_residuals_m": [row["residual_m"] for row in control],
         "control_rms_m": rms(residuals),
@@ -55,16 +54,6 @@ def variant_numbers(found: Solved, tie_ids: Sequence[str] = ()) -> dict[str, Any
         "not_determined": [entry.to_dict() for entry in found.check.errors.not_determined],
         "shared_unknowns": [asdict(unknown) for unknown in unknowns_of(found)],
         "correlations": [asdict(c) for c in correlations_of(found)],
-    }
-
-
-def component_numbers(part: Component) -> dict[str, Any]:
-    """factor: estimated over stated 1-sigma; None where too little checks the group."""
-    return {
-        "observations": part.observations,
-        "redundancy": part.redundancy,
-        "factor": part.factor,
-        "factor_sigma": part.factor_sigma,
     }
 
 

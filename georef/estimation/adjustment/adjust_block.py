@@ -113,7 +113,6 @@ def adjust_block(
     options = replace(options, reference_m=float(np.hypot(options.reference_m, shared_by_references(block))))
     hand = _InHand(block, Prepared.of(block))
     hand, state, found = _robust(hand, start or block.start(), options, solve)
-    options = replace(options, solver=replace(options.solver, damping=1e-6))
     gated = hand.gated(found, _gross(options))
     search = search_coherent(
         *(gated.block, state, options.losses), reference_m=options.reference_m, prepared=gated.prepared

@@ -12,9 +12,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from georef.config import AdjustConfig
-from georef.estimation.adjustment.adjust_block import Quality, quality
+from georef.estimation.adjustment.adjust_block import SETTLED_SHARE, Quality, quality
 from georef.estimation.adjustment.block import KINDS_OF_POSE, Block, Calibration, PosePriors, RigCamera, State
 from georef.estimation.adjustment.equations.eliminate import IMAGE_OBSERVATIONS
+from georef.estimation.adjustment.equations.prepared import Prepared
 from georef.estimation.adjustment.quality.components import Component
 from georef.estimation.adjustment.quality.group_tests import TermTests
 from georef.estimation.adjustment.solver import SolverOptions, solve_block
@@ -27,7 +28,6 @@ ORIENTATION = KINDS_OF_POSE[1]
 _GATE_ROUNDS, _ROBUST_ROUNDS = 3, 2
 _ROBUST_COST_TOLERANCE = 1e-5
 _FAR_OFF = 1.25  # of a sigma against its residuals
-_SETTLED_SHARE = 1e-4  # of the observations: a gate that drops fewer changes nothing
 _FACTOR_TOLERANCE = 0.01
 _GROSS = 1e-3  # share of the false alarms of a gate that the first one may give: a robust solution is not the best one
 
@@ -103,7 +103,7 @@ def adjust_network(block: Block, config: AdjustConfig) -> AdjustedNetwork:
     network = _rescaled(network, options)
     for _ in range(_GATE_ROUNDS):
         gated = _gated(network, config.gate_probability)
-        if len(network.block.observations) - len(gated.observations) <= _SETTLED_SHARE * given:
+        if len(network.block.observations) - len(gated.observations) <= SETTLED_SHARE * given:
             break
         network = _solved(gated, network, options)
     return _rescaled(network, options)
@@ -115,8 +115,9 @@ def _robust(block: Block, config: AdjustConfig, options: SolverOptions) -> Adjus
     options = replace(options, cost_tolerance=_ROBUST_COST_TOLERANCE)
     state = block.start()
     for _ in range(1 + _ROBUST_ROUNDS):
-        state = solve_block(block, losses=losses, options=options, start=state).state
-        found = quality(block, state)
+        prepared = Prepared.of(block)
+        state = solve_block(block, losses=losses, options=options, start=state, prepared=prepared).state
+        found = quality(block, state, prepared)
         factor = min(max(found.images.scale, 0.1), 10.0)
         if 1.0 / _FAR_OFF < factor < _FAR_OFF:
             return AdjustedNetwork(block, state, found, scale)
@@ -125,8 +126,9 @@ def _robust(block: Block, config: AdjustConfig, options: SolverOptions) -> Adjus
 
 
 def _solved(block: Block, before: AdjustedNetwork, options: SolverOptions) -> AdjustedNetwork:
-    state = solve_block(block, options=options, start=before.state).state
-    return AdjustedNetwork(block, state, quality(block, state), before.sigma_scale)
+    prepared = Prepared.of(block)
+    state = solve_block(block, options=options, start=before.state, prepared=prepared).state
+    return AdjustedNetwork(block, state, quality(block, state, prepared), before.sigma_scale)
 
 
 def _gated(network: AdjustedNetwork, probability: float) -> Block:

@@ -105,10 +105,7 @@ def _position_priors(block: Block, state: State, layout: Layout) -> Term:
     priors = block.position_priors
     poses, lever_m = state.world_from_rig.take(priors.station), state.lever_arms_m[priors.antenna]
     node, weight = drift_at(block)
-    residual = poses.apply(lever_m) - priors.position
     by_drift = weight[:, :, None, None] * np.eye(3)
-    if len(state.drift_m):
-        residual = residual + np.einsum("kn,kni->ki", weight, state.drift_m[node])
     columns = (
         (6 * priors.station, np.concatenate([-poses.rotation @ skew(lever_m), poses.rotation], axis=2)),
         (_in_border(layout, layout.antenna[priors.antenna]), poses.rotation),
@@ -117,7 +114,16 @@ def _position_priors(block: Block, state: State, layout: Layout) -> Term:
             for n in range(2)
         ),
     )
-    return _term(POSITION_PRIORS, whitening(priors.cov), residual, columns)
+    return _term(POSITION_PRIORS, whitening(priors.cov), position_residuals(block, state), columns)
+
+
+def position_residuals(block: Block, state: State) -> Array:
+    """Adjusted less measured positions (K, 3) of antennas, the estimated drift taken off."""
+    priors, (node, weight) = block.position_priors, drift_at(block)
+    residual = state.world_from_rig.take(priors.station).apply(state.lever_arms_m[priors.antenna]) - priors.position
+    if len(state.drift_m):
+        residual = residual + np.einsum("kn,kni->ki", weight, state.drift_m[node])
+    return residual
 
 
 def drift_at(block: Block) -> tuple[Indices, Array]:

@@ -7,6 +7,7 @@ redundancies add up to that of the whole adjustment.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -20,6 +21,11 @@ class Component:
     observations: int  # number of scalar observations
     redundancy: float
     squares: float  # v' P v
+
+    def to_dict(self) -> dict[str, Any]:
+        """As reports hold it."""
+        own = {"observations": self.observations, "redundancy": self.redundancy}
+        return own | {"factor": self.factor, "factor_sigma": self.factor_sigma}
 
     @property
     def factor(self) -> float | None:
